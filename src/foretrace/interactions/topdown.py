@@ -1,0 +1,178 @@
+"""The object seen from above in the action frame: what the paper's predictors look at.
+
+The picture has 128 x 128 pixels of 3.2 mm. The action direction (x) points up, y to the left. The contact
+point lies between two rows and two columns, so that the grid is its own mirror image about the action axis.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+from numpy.typing import ArrayLike
+
+from foretrace.actions import LeverUp
+from foretrace.errors import ActionError, ShapeError, ViewError
+from foretrace.geometry import mask_outline
+from foretrace.objects import ObjectModel, read_silhouette, silhouette_origin
+
+VIEW_SIZE = 128
+"""Rows and columns of a view."""
+METRES_PER_PIXEL = 0.0032
+"""Side of a pixel [m]."""
+ROWS_AHEAD = 96
+"""Rows of pixels ahead of the contact point; the rest lies behind it."""
+MINIMAL_HEIGHT = 0.004
+"""Points of a cloud below this height belong to the table [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class TopDownView:
+    """Mask and height map of an object from above, in the action frame."""
+
+    mask: Bool[np.ndarray, "128 128"]
+    """Where the object is."""
+    height: Float[np.ndarray, "128 128"]
+    """Height of its upper surface above the table [m], 0 beside it."""
+    metres_per_pixel: float = METRES_PER_PIXEL
+    """Side of a pixel [m]."""
+
+    @classmethod
+    def of(cls, obj: ObjectModel, action: LeverUp) -> Self:
+        """The exact view of a known object: a pixel shows what lies at its centre.
+
+        Raises:
+            ViewError: if the object does not fit into the window.
+        """
+        _check_window(_to_action(obj.corners, action))
+        # Only the pixels of the outline's bounding box are asked about.
+        first, last = np.sort(_pixels_of(_to_action(obj.corners, action)), axis=0)[[0, -1]]
+        low = np.maximum(np.floor(first).astype(int), 0)
+        high = np.minimum(np.ceil(last).astype(int), VIEW_SIZE - 1) + 1
+        centres = _pixel_centres()[low[0] : high[0], low[1] : high[1]]
+        heights = obj.height_at(_to_object(centres.reshape(-1, 2), action))
+        height = np.zeros((VIEW_SIZE, VIEW_SIZE), dtype=np.float32)
+        height[low[0] : high[0], low[1] : high[1]] = heights.reshape(centres.shape[:2])
+        return cls(height > 0, height)
+
+    @classmethod
+    def from_mask(
+        cls,
+        mask: Shaped[np.ndarray, "rows columns"],
+        metres_per_pixel: float,
+        contact: ArrayLike,
+        direction: ArrayLike,
+        height: float = 0.02,
+    ) -> Self:
+        """The view of an object known by its silhouette alone.
+
+        Args:
+            mask: the object not 0 (or True), the background 0. Holes are filled.
+            metres_per_pixel: scale of the image [m].
+            contact: contact point in the frame of ``Prism.from_mask``: metres from the silhouette's centroid,
+                x to the right in the image and y up.
+            direction: action direction in the same frame.
+            height: height to assume [m].
+
+        Raises:
+            ViewError: if the image does not show one whole object, or it does not fit into the window.
+        """
+        if not (np.isfinite(metres_per_pixel) and metres_per_pixel > 0):
+            raise ViewError(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
+        try:
+            silhouette = read_silhouette(mask)
+            action = LeverUp(np.asarray(contact, dtype=float), np.asarray(direction, dtype=float))
+        except (ShapeError, ActionError) as error:
+            raise ViewError(str(error)) from error
+        origin = silhouette_origin(silhouette)
+        outline = (mask_outline(silhouette) - origin)[:, ::-1] * [metres_per_pixel, -metres_per_pixel]
+        _check_window(_to_action(outline, action))
+        in_object = _to_object(_pixel_centres().reshape(-1, 2), action)
+        in_image = (in_object * [1.0, -1.0] / metres_per_pixel)[:, ::-1] + origin  # (row, column)
+        rows, columns = (in_image.T + 1.0).astype(np.float32).reshape(2, VIEW_SIZE, VIEW_SIZE)
+        padded = np.pad(silhouette, 1).astype(np.float32)
+        seen = cv2.remap(padded, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) >= 0.5
+        return cls(seen, np.where(seen, np.float32(height), np.float32(0)))
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Float[np.ndarray, "k 3"],
+        minimal_height: float = MINIMAL_HEIGHT,
+        close_holes: bool = True,
+    ) -> Self:
+        """The view of a point cloud, as depth cameras see it.
+
+        Args:
+            points: points in the action frame [m]; those outside the window are left out.
+            minimal_height: points below it belong to the table [m].
+            close_holes: fill gaps of a pixel between points by morphological closing.
+
+        Raises:
+            ViewError: if no point of the object lies in the window.
+        """
+        points = points[np.isfinite(points).all(axis=1)]
+        pixels = np.rint(_pixels_of(points[:, :2])).astype(int)
+        kept = ((pixels >= 0) & (pixels < VIEW_SIZE)).all(axis=1) & (points[:, 2] > minimal_height)
+        if not kept.any():
+            raise ViewError(
+                f"no point of {len(points)} is in the window above {minimal_height} m: check the camera pose"
+            )
+        height = np.zeros((VIEW_SIZE, VIEW_SIZE), dtype=np.float32)
+        np.maximum.at(height, tuple(pixels[kept].T), points[kept, 2].astype(np.float32))
+        if close_holes:
+            closed = cv2.morphologyEx(height, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+            height = np.where(height > 0, height, closed)
+        return cls(height > 0, height)
+
+    def to_pixels(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
+        """Pixels (row, column) of points in the action frame [m]; pixel centres are whole numbers."""
+        return _pixels_of(points)
+
+    def to_metres(self, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
+        """Points in the action frame [m] of pixel coordinates (row, column)."""
+        return _metres_of(pixels)
+
+    def contour(self) -> Float[np.ndarray, "k 2"]:
+        """Outline of the largest object in the mask, counter-clockwise in the action frame [m]."""
+        if not self.mask.any():
+            raise ViewError("the view's mask is empty: it has no contour")
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(self.mask.astype(np.uint8), connectivity=8)
+        largest = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+        return _metres_of(mask_outline(largest)[::-1])
+
+
+def _pixels_of(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
+    return np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5]) - points / METRES_PER_PIXEL
+
+
+def _metres_of(pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    return (np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5]) - pixels) * METRES_PER_PIXEL
+
+
+def _pixel_centres() -> Float[np.ndarray, "128 128 2"]:
+    grid = np.stack(np.meshgrid(np.arange(VIEW_SIZE), np.arange(VIEW_SIZE), indexing="ij"), axis=-1)
+    return _metres_of(grid.astype(float))
+
+
+def _to_action(points: Float[np.ndarray, "k 2"], action: LeverUp) -> Float[np.ndarray, "k 2"]:
+    transform = action.T_action_object
+    return points @ transform[:2, :2].T + transform[:2, 3]
+
+
+def _to_object(points: Float[np.ndarray, "k 2"], action: LeverUp) -> Float[np.ndarray, "k 2"]:
+    return points @ action.T_action_object[:2, :2] + action.contact
+
+
+def _check_window(outline: Float[np.ndarray, "k 2"]) -> None:
+    """Refuse outlines (action frame) that leave the window."""
+    high = _metres_of(np.array([-0.5, -0.5]))
+    low = _metres_of(np.array([VIEW_SIZE - 0.5, VIEW_SIZE - 0.5]))
+    if (outline < low).any() or (outline > high).any():
+        (x0, y0), (x1, y1) = outline.min(axis=0), outline.max(axis=0)
+        raise ViewError(
+            f"object reaches x {x0:.3f} to {x1:.3f} m and y {y0:.3f} to {y1:.3f} m in the action frame: "
+            f"the window covers x {low[0]:.3f} to {high[0]:.3f} and y {low[1]:.3f} to {high[1]:.3f}; "
+            "choose another contact or check the scale"
+        )

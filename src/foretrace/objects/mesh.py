@@ -1,0 +1,259 @@
+"""Objects given as closed triangle meshes."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull
+
+from foretrace.errors import ShapeError
+from foretrace.geometry import convex_hull, inward_normals, polygon_area
+from foretrace.objects.model import (
+    BEVEL,
+    Bevel,
+    MassProperties,
+    ObjectModel,
+    check_size,
+    largest_distance,
+    read_only,
+)
+
+if TYPE_CHECKING:
+    import trimesh
+
+OUTLINE_TOLERANCE = 0.0005
+"""How far the outline's polygon may leave the mesh's projection [m]."""
+FOOT_HEIGHT = 0.0005
+"""Points of the mesh below this height are taken to stand on the table [m]."""
+CONCAVITY = 0.03
+"""Threshold of the convex decomposition: the largest concavity left in a piece, relative to the mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshObject(ObjectModel):
+    """A closed triangle mesh of uniform density, standing as its file has it.
+
+    The mesh is moved so that its lowest point lies on the table and the origin below its centre of mass.
+    Mass, centre of mass, inertia and view come from the mesh itself; collisions from convex pieces, whose
+    lower rim is chamfered along the hull of the outline so that a blade gets under it.
+
+    Raises:
+        ShapeError: if the mesh is not watertight or has no believable size.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    """Vertices in the object frame [m]."""
+    faces: Int[np.ndarray, "f 3"]
+    """Vertex indices of each triangle."""
+    bevel: Bevel = BEVEL
+    """Chamfer of the collision pieces' lower rim."""
+    corners: Float[np.ndarray, "n 2"] = field(init=False, repr=False)
+    """Outline of the mesh seen from above, simplified, counter-clockwise [m]."""
+    height: float = field(init=False)
+    """Largest height above the table [m]."""
+
+    def __post_init__(self) -> None:
+        mesh = self._check_mesh()
+        shift = np.array([*mesh.center_mass[:2], mesh.bounds[0, 2]])
+        # A mesh that lies right already is kept to the last digit: a stored object comes back as it was.
+        vertices = mesh.vertices if np.abs(shift).max() < 1e-9 else mesh.vertices - shift
+        object.__setattr__(self, "vertices", read_only(vertices))
+        object.__setattr__(self, "faces", read_only(mesh.faces, np.int64))
+        object.__setattr__(self, "height", float(self.vertices[:, 2].max()))
+        triangles = flat_polygons(self.vertices[self.faces])
+        outline = shapely.union_all(triangles[shapely.area(triangles) > 0]).buffer(0)
+        parts = shapely.get_parts(outline)
+        largest = parts[np.argmax(shapely.area(parts))]
+        corners = shapely.get_coordinates(shapely.Polygon(largest.exterior).simplify(OUTLINE_TOLERANCE))[:-1]
+        object.__setattr__(
+            self, "corners", read_only(corners if polygon_area(corners) > 0 else corners[::-1])
+        )
+
+    def _check_mesh(self) -> "trimesh.Trimesh":
+        vertices, faces = np.asarray(self.vertices, dtype=float), np.asarray(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise ShapeError(
+                f"mesh has vertices {vertices.shape} and faces {faces.shape}: expected (v, 3) and (f, 3)"
+            )
+        if len(vertices) == 0 or len(faces) == 0:
+            raise ShapeError(
+                f"mesh with {len(vertices)} vertices and {len(faces)} faces is empty: give a closed surface"
+            )
+        if not np.isfinite(vertices).all():
+            bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+            raise ShapeError(
+                f"mesh vertex {bad} is {vertices[bad].tolist()}: every coordinate must be finite"
+            )
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise ShapeError(
+                f"mesh faces name vertices {faces.min()} to {faces.max()}: there are {len(vertices)}"
+            )
+        check_size(largest_distance(np.unique(vertices, axis=0)), float(np.ptp(vertices[:, 2])))
+        import trimesh  # a second to import, and most objects are prisms
+
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        if not mesh.is_watertight:
+            _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+            raise ShapeError(
+                f"mesh is not watertight ({int((uses != 2).sum())} edges without exactly two faces): "
+                "close its holes in a mesh editor"
+            )
+        if not mesh.is_winding_consistent:
+            trimesh.repair.fix_winding(mesh)
+        if mesh.volume < 0:
+            mesh.invert()
+        return mesh
+
+    @classmethod
+    def load(cls, path: str | Path, scale: float = 1.0, bevel: Bevel = BEVEL) -> Self:
+        """A mesh from an STL or OBJ file.
+
+        Args:
+            path: the file; z must point up.
+            scale: metres per unit of the file, e.g. 0.001 for a file in millimetres.
+            bevel: chamfer of the collision pieces' lower rim.
+
+        Raises:
+            ShapeError: if the file cannot be read or the mesh is not usable.
+        """
+        import trimesh
+
+        path = Path(path)
+        if not path.is_file():
+            raise ShapeError(f"mesh file {path} does not exist: check the path")
+        try:
+            mesh = trimesh.load_mesh(path, process=True)
+        except Exception as error:  # trimesh's readers raise whatever the broken file makes them stumble over
+            raise ShapeError(f"mesh file {path} cannot be read ({error}): give an STL or OBJ file") from error
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            raise ShapeError(f"mesh file {path} holds no triangles: give an STL or OBJ file of a closed body")
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        try:
+            return cls(np.array(mesh.vertices) * scale, np.array(mesh.faces, dtype=np.int64), bevel)
+        except ShapeError as error:
+            raise ShapeError(f"{path}: {error}") from error
+
+    def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:
+        """Vertices of the convex parts, in the object frame [m].
+
+        A convex mesh is one piece; any other is decomposed approximately (CoACD, fixed seed).
+        """
+        return self._pieces
+
+    @property
+    def support_corners(self) -> Float[np.ndarray, "n 2"]:
+        """The footprint's point nearest to each corner of the outline, in the object frame [m]."""
+        return self._support_corners
+
+    def mass_properties(self, density: float) -> MassProperties:
+        """Mass, centre of mass and inertia of the mesh itself, without the bevel, for a density [kg/m^3]."""
+        mesh = self._mesh
+        mesh.density = density
+        properties = mesh.mass_properties
+        return MassProperties(
+            float(properties.mass), np.array(properties.center_mass), np.array(properties.inertia)
+        )
+
+    def height_at(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:
+        """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
+        triangles = self.vertices[self.faces]
+        origin, side_a, side_b = (
+            triangles[:, 0],
+            triangles[:, 1] - triangles[:, 0],
+            triangles[:, 2] - triangles[:, 0],
+        )
+        normals = np.cross(side_a, side_b)
+        facing_up = normals[:, 2] > 1e-12
+        origin, normals = origin[facing_up], normals[facing_up]
+        tree = shapely.STRtree(flat_polygons(triangles[facing_up]))
+        index, face = tree.query(shapely.points(points), predicate="intersects")
+        away = points[index] - origin[face, :2]
+        heights = origin[face, 2] - (away * normals[face, :2]).sum(axis=1) / normals[face, 2]
+        surface = np.zeros(len(points))
+        np.maximum.at(surface, index, heights)
+        return surface
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything needed to make the object again, as plain JSON values."""
+        return {
+            "kind": "mesh",
+            "vertices": self.vertices.tolist(),
+            "faces": self.faces.tolist(),
+            "bevel": [self.bevel.width, self.bevel.height],
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """The object that ``to_dict`` described."""
+        return cls(
+            np.array(values["vertices"]), np.array(values["faces"], dtype=np.int64), Bevel(*values["bevel"])
+        )
+
+    @cached_property
+    def _mesh(self) -> "trimesh.Trimesh":
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+    @cached_property
+    def _pieces(self) -> list[np.ndarray]:
+        if self._mesh.is_convex:
+            pieces = [np.array(self.vertices)]
+        else:
+            import coacd
+
+            coacd.set_log_level("error")
+            found = coacd.run_coacd(
+                coacd.Mesh(self.vertices, self.faces), threshold=CONCAVITY, preprocess_mode="auto", seed=0
+            )
+            pieces = [np.asarray(vertices, dtype=float) for vertices, _ in found]
+        rim = convex_hull(np.array(self.corners))
+        normals = inward_normals(rim)
+        bevelled = []
+        for vertices in pieces:
+            piece = vertices
+            if self.bevel.height > 0:
+                slope = self.bevel.width / self.bevel.height
+                for corner, normal in zip(rim, normals, strict=True):
+                    # The body recedes below the bevel's height: n . x + slope z >= n . corner + width.
+                    plane = np.array([*normal, slope])
+                    piece = clip_polytope(piece, plane, float(normal @ corner) + self.bevel.width)
+            if len(piece) >= 4:
+                bevelled.append(read_only(piece[ConvexHull(piece).vertices]))
+        return bevelled
+
+    @cached_property
+    def _support_corners(self) -> np.ndarray:
+        points = np.concatenate(self._pieces)
+        lowest = points[:, 2].min()
+        foot = shapely.MultiPoint(points[points[:, 2] < lowest + FOOT_HEIGHT, :2]).convex_hull
+        return read_only(
+            shapely.get_coordinates(shapely.shortest_line(foot, shapely.points(self.corners)))[::2]
+        )
+
+
+def flat_polygons(triangles: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
+    """The triangles' projections onto the table, as shapely polygons."""
+    return np.asarray(shapely.polygons(triangles[:, :, :2]), dtype=object)
+
+
+def clip_polytope(
+    vertices: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"], offset: float
+) -> Float[np.ndarray, "m 3"]:
+    """Vertices of the part of a convex body where ``normal . x >= offset``; no rows where nothing is left."""
+    depth = vertices @ normal - offset
+    kept, cut = depth >= 0, depth < -1e-12
+    if not cut.any():
+        return vertices
+    if not (depth > 1e-12).any():
+        return np.zeros((0, 3))
+    inner, outer = vertices[kept], vertices[cut]
+    # Every segment between a kept and a dropped vertex lies in the body, and the true edges are among them.
+    share = depth[kept][:, None] / (depth[kept][:, None] - depth[cut][None])
+    crossings = inner[:, None] + share[..., None] * (outer[None] - inner[:, None])
+    points = np.concatenate([inner, crossings.reshape(-1, 3)])
+    return points[ConvexHull(points).vertices]

@@ -1,0 +1,141 @@
+"""What every object offers, and the checks that all objects share."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from foretrace.errors import ShapeError
+
+SIZE_LIMITS = (0.01, 1.0)
+"""Smallest and largest believable length of an object [m]: anything else is a wrong unit or scale."""
+HEIGHT_LIMITS = (0.001, 1.0)
+"""Smallest and largest believable height of an object [m]."""
+
+
+@dataclass(frozen=True)
+class Bevel:
+    """A chamfer all round an object's lower rim, which lets a blade get under it."""
+
+    width: float = 0.005
+    """How far the bottom face lies inside the outline [m]."""
+    height: float = 0.005
+    """Height above the table at which the outline is reached [m]."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.width, self.height]).all() and min(self.width, self.height) >= 0):
+            raise ShapeError(f"bevel of {self.width} m x {self.height} m: both must be finite and at least 0")
+        if (self.width == 0) != (self.height == 0):
+            raise ShapeError(
+                f"bevel of {self.width} m x {self.height} m: use positive values, or NO_BEVEL for a sharp rim"
+            )
+
+
+BEVEL = Bevel()
+NO_BEVEL = Bevel(0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """How an object's mass is distributed, in its own frame."""
+
+    mass: float
+    """Mass [kg]."""
+    com: Float[np.ndarray, "3"]
+    """Centre of mass in the object frame [m]."""
+    inertia: Float[np.ndarray, "3 3"]
+    """Inertia about the centre of mass, along the object's axes [kg m^2]."""
+
+
+class ObjectModel(ABC):
+    """A rigid object of uniform density at rest on the table.
+
+    The object frame is the one its corners are given in; z points up and z = 0 is the table side.
+    Objects are frozen and their arrays read-only.
+    """
+
+    corners: Float[np.ndarray, "n 2"]
+    """Outline seen from above, counter-clockwise, object frame [m]. Edge k runs from corner k to k + 1."""
+    height: float
+    """Largest height above the table [m]."""
+
+    @abstractmethod
+    def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:
+        """Vertices of the convex parts that make up the object for collisions, in the object frame [m]."""
+
+    @property
+    @abstractmethod
+    def support_corners(self) -> Float[np.ndarray, "n 2"]:
+        """Where the object stands on the table near each of its corners, in the object frame [m]."""
+
+    @abstractmethod
+    def mass_properties(self, density: float) -> MassProperties:
+        """Mass, centre of mass and inertia for a uniform density [kg/m^3]."""
+
+    @abstractmethod
+    def height_at(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:
+        """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """Everything needed to make the object again, as plain JSON values."""
+
+    @cached_property
+    def size(self) -> float:
+        """Largest distance between two corners [m]."""
+        return largest_distance(self.corners)
+
+
+def largest_distance(points: Float[np.ndarray, "n dimensions"]) -> float:
+    """Largest distance between any two points [m]."""
+    if len(points) > 100:
+        points = points[ConvexHull(points).vertices]
+    return float(np.linalg.norm(points[:, None] - points[None], axis=-1).max())
+
+
+def check_size(size: float, height: float) -> None:
+    """Refuse objects that are too small or too large to be meant.
+
+    Raises:
+        ShapeError: if the size or the height [m] lies outside its limits.
+    """
+    for name, value, (low, high) in (("size", size, SIZE_LIMITS), ("height", height, HEIGHT_LIMITS)):
+        if not low <= value <= high:
+            raise ShapeError(
+                f"object of {name} {value:.4g} m: expected {low} to {high} m; check unit (metres) or scale"
+            )
+
+
+def read_only(values: Any, dtype: type = float) -> np.ndarray:
+    """A copy of an array that nobody can change."""
+    array = np.array(values, dtype=dtype)
+    array.setflags(write=False)
+    return array
+
+
+def convex_mass_properties(pieces: list[Float[np.ndarray, "_ 3"]], density: float) -> MassProperties:
+    """Exact mass properties of convex pieces that do not overlap [kg, m].
+
+    Each piece is cut into tetrahedra between an inner point and the triangles of its hull.
+    """
+    tetrahedra = []
+    for piece in pieces:
+        apex = piece.mean(axis=0)
+        faces = piece[ConvexHull(piece).simplices]  # (face, corner, xyz)
+        tetrahedra.append(np.concatenate([faces, np.broadcast_to(apex, (len(faces), 1, 3))], axis=1))
+    corners = np.concatenate(tetrahedra)
+    masses = density * np.abs(np.linalg.det(corners[:, :3] - corners[:, 3:])) / 6
+    mass = masses.sum()
+    com = masses @ corners.mean(axis=1) / mass
+    local = corners - com
+    total = local.sum(axis=1)
+    # Second moments of a tetrahedron: (sum of v v^T over its corners + (sum of v)(sum of v)^T) / 20.
+    moments = np.einsum("t,tci,tcj->ij", masses, local, local) + np.einsum(
+        "t,ti,tj->ij", masses, total, total
+    )
+    moments /= 20
+    return MassProperties(float(mass), com, np.trace(moments) * np.eye(3) - moments)

@@ -1,0 +1,327 @@
+"""Prisms: an outline drawn on the table and extruded, with a bevelled lower rim."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Shaped
+from numpy.typing import ArrayLike
+
+from foretrace.errors import ShapeError
+from foretrace.geometry import clip_polygon, convex_hull, inward_normals, is_convex, polygon_area
+from foretrace.objects.model import (
+    BEVEL,
+    Bevel,
+    MassProperties,
+    ObjectModel,
+    check_size,
+    convex_mass_properties,
+    largest_distance,
+    read_only,
+)
+from foretrace.objects.silhouette import silhouette_polygon
+
+DEFAULT_HEIGHT = 0.02
+"""Height of a prism [m]."""
+CIRCLE_RADIUS = 0.10
+"""Radius of the circle on which sampled corners lie [m] (paper, section 4)."""
+CORNER_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10)
+"""Corner counts of the paper's objects (section 4)."""
+LARGEST_GAP = np.deg2rad(170.0)
+"""Largest angle between neighbouring sampled corners [rad]: keeps the centre 8.7 mm inside."""
+SMALLEST_GAP = np.deg2rad(12.0)
+"""Smallest angle between neighbouring sampled corners [rad]: no edge under 2.1 cm."""
+SAME_CORNER = 1e-6
+"""Corners nearer than this are the same corner [m]."""
+SMALLEST_PIECE = 1e-7
+"""Convex parts below this area are left out [m^2]: collision meshes need a volume."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prism(ObjectModel):
+    """A polygon extruded upwards, standing on a bottom face that a bevel makes smaller than the outline.
+
+    Corners may be given clockwise: they are reordered counter-clockwise, keeping the first corner first.
+
+    Raises:
+        ShapeError: for fewer than three corners, values that are not finite, repeated corners, no area,
+            self-intersection, a size or height beyond belief, or a bevel that leaves no bottom face.
+    """
+
+    corners: Float[np.ndarray, "n 2"]
+    """Corners of the simple polygon, convex or not, in the object frame [m]."""
+    height: float = DEFAULT_HEIGHT
+    """Height of the extrusion [m]."""
+    bevel: Bevel = BEVEL
+    """Chamfer of the lower rim."""
+
+    def __post_init__(self) -> None:
+        corners = check_polygon(self.corners)
+        object.__setattr__(self, "corners", corners)
+        object.__setattr__(self, "height", float(self.height))
+        check_size(self.size, self.height)
+        if self.bevel.height >= self.height:
+            raise ShapeError(
+                f"bevel of height {self.bevel.height} m on an object of height {self.height} m: "
+                "pass a lower bevel=Bevel(width, height) or NO_BEVEL"
+            )
+        if shapely.is_empty(self._bottom):
+            raise ShapeError(
+                f"bevel of width {self.bevel.width} m leaves no bottom face (widest inner circle has radius "
+                f"{inner_radius(corners):.4g} m): pass a narrower bevel=Bevel(width, height) or NO_BEVEL"
+            )
+
+    @classmethod
+    def from_mask(
+        cls,
+        mask: Shaped[np.ndarray, "rows columns"],
+        metres_per_pixel: float,
+        height: float = DEFAULT_HEIGHT,
+        bevel: Bevel | None = None,
+        tolerance: float | None = None,
+    ) -> Self:
+        """The prism whose outline is a silhouette.
+
+        Args:
+            mask: the object not 0 (or True), the background 0. Holes are filled; specks below 1 % of the
+                object's area are ignored.
+            metres_per_pixel: scale of the image [m].
+            height: height of the prism [m].
+            bevel: chamfer of the lower rim; by default the usual one, narrowed for thin objects to half
+                the radius of the widest circle inside.
+            tolerance: how far the polygon may leave the outline [m]; 1 mm by default, never below 0.75 pixel.
+
+        Returns:
+            The prism, origin at the silhouette's centroid, x to the right in the image and y up.
+
+        Raises:
+            ShapeError: for a mask that is empty, shows several objects or an object cut off by the border.
+        """
+        corners = silhouette_polygon(mask, metres_per_pixel, tolerance)
+        if bevel is None:
+            narrowest = min(1.0, 0.5 * inner_radius(corners) / BEVEL.width, 0.5 * height / BEVEL.height)
+            bevel = Bevel(BEVEL.width * narrowest, BEVEL.height * narrowest)
+        return cls(corners, height, bevel)
+
+    def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:
+        """Vertices of the convex parts, in the object frame [m].
+
+        A convex polygon of at most ten corners around the origin is built as the paper's wedges between
+        centre and edges (figure 7), any other convex polygon in one piece, and a polygon that is not convex
+        from its constrained Delaunay triangles, merged where the union stays convex.
+        """
+        return self._pieces
+
+    @property
+    def support_corners(self) -> Float[np.ndarray, "n 2"]:
+        """Where the bottom face has its corners, one for each corner of the outline, in the object frame [m].
+
+        A corner whose inset lies beyond the bottom face, as at a thin tip, gets the face's nearest point.
+        """
+        return self._support_corners
+
+    def mass_properties(self, density: float) -> MassProperties:
+        """Exact mass, centre of mass and inertia of the bevelled body for a uniform density [kg/m^3]."""
+        return convex_mass_properties(self._pieces, density)
+
+    def height_at(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:
+        """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
+        return np.where(shapely.intersects_xy(self._polygon, points[:, 0], points[:, 1]), self.height, 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything needed to make the prism again, as plain JSON values."""
+        return {
+            "kind": "prism",
+            "corners": self.corners.tolist(),
+            "height": self.height,
+            "bevel": [self.bevel.width, self.bevel.height],
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """The prism that ``to_dict`` described."""
+        return cls(np.array(values["corners"]), values["height"], Bevel(*values["bevel"]))
+
+    @cached_property
+    def _polygon(self) -> shapely.Polygon:
+        polygon = shapely.Polygon(self.corners)
+        shapely.prepare(polygon)
+        return polygon
+
+    @cached_property
+    def _bottom(self) -> shapely.Geometry:
+        """The bottom face: the outline shrunk by the bevel, in one or several parts."""
+        if is_convex(self.corners):
+            inset = clip_edges(self.corners, self.corners, range(len(self.corners)), self.bevel.width)
+            return shapely.Polygon(inset)
+        return self._polygon.buffer(-self.bevel.width, join_style="mitre")
+
+    @cached_property
+    def _pieces(self) -> list[np.ndarray]:
+        pieces = []
+        for part, own_edges in self._parts():
+            lower = clip_edges(part, self.corners, own_edges, self.bevel.width)
+            if len(lower) and not is_convex(self.corners):
+                inside = shapely.get_coordinates(shapely.Polygon(lower).intersection(self._bottom))
+                lower = convex_hull(inside)
+            layers = [(part, self.bevel.height), (part, self.height)]
+            if len(lower) >= 3 and self.bevel.height > 0:
+                layers.insert(0, (lower, 0.0))
+            piece = np.concatenate([np.column_stack([xy, np.full(len(xy), z)]) for xy, z in layers])
+            pieces.append(read_only(np.unique(piece, axis=0)))
+        return pieces
+
+    def _parts(self) -> list[tuple[np.ndarray, range | list[int]]]:
+        """Convex parts of the outline, each with the edges of the outline that bevel it."""
+        num_corners = len(self.corners)
+        if is_convex(self.corners):
+            every_edge = range(num_corners)
+            centre = np.zeros(2)
+            clear = shapely.contains_xy(self._bottom, 0.0, 0.0)
+            if not clear or num_corners > CORNER_COUNTS[-1]:
+                return [(self.corners, every_edge)]
+            following = np.roll(self.corners, -1, axis=0)
+            return [
+                (np.array([centre, a, b]), every_edge) for a, b in zip(self.corners, following, strict=True)
+            ]
+        parts = []
+        for indices in convex_parts(self.corners):
+            part = self.corners[indices]
+            if polygon_area(part) > SMALLEST_PIECE:
+                following = [*indices[1:], indices[0]]
+                own = [i for i, j in zip(indices, following, strict=True) if j == (i + 1) % num_corners]
+                parts.append((part, own))
+        return parts
+
+    @cached_property
+    def _support_corners(self) -> np.ndarray:
+        normals = inward_normals(self.corners)
+        before = np.roll(normals, 1, axis=0)
+        # The mitre point m solves normal . m = normal . corner + width for both edges of the corner.
+        bisector = normals + before
+        mitred = self.corners + bisector * (self.bevel.width / (1 + (normals * before).sum(axis=1)))[:, None]
+        inset = shapely.points(mitred)
+        near = shapely.distance(inset, self._bottom) < SAME_CORNER
+        nearest = shapely.get_coordinates(shapely.shortest_line(self._bottom, shapely.points(self.corners)))[
+            ::2
+        ]
+        return read_only(np.where(near[:, None], mitred, nearest))
+
+
+def check_polygon(corners: ArrayLike) -> Float[np.ndarray, "n 2"]:
+    """A simple polygon's corners, counter-clockwise and read-only [m].
+
+    Raises:
+        ShapeError: naming the fault, if the corners do not bound a simple polygon.
+    """
+    try:
+        corners = np.asarray(corners, dtype=float)
+    except (TypeError, ValueError):
+        raise ShapeError("corners are not an (n, 2) table of numbers: give x and y in metres") from None
+    if corners.ndim != 2 or corners.shape[1] != 2:
+        raise ShapeError(f"corners have shape {corners.shape}: expected (n, 2), x and y in metres")
+    if len(corners) < 3:
+        raise ShapeError(f"polygon with {len(corners)} corners: at least 3 are needed")
+    if not np.isfinite(corners).all():
+        bad = int(np.flatnonzero(~np.isfinite(corners).all(axis=1))[0])
+        raise ShapeError(f"corner {bad} is {corners[bad].tolist()}: every coordinate must be finite")
+    first, second = np.triu_indices(len(corners), 1)
+    same = np.linalg.norm(corners[first] - corners[second], axis=1) < SAME_CORNER
+    if same.any():
+        k = int(np.flatnonzero(same)[0])
+        raise ShapeError(
+            f"corners {first[k]} and {second[k]} are both {corners[first[k]].tolist()}: "
+            "give each corner once, without closing the polygon"
+        )
+    size = largest_distance(corners)
+    centred = corners - corners.mean(axis=0)
+    if np.linalg.svd(centred, compute_uv=False)[1] < 1e-6 * size:
+        raise ShapeError(f"polygon with {len(corners)} corners on one line has no area: check the corners")
+    polygon = shapely.Polygon(corners)
+    if not polygon.is_valid:
+        raise ShapeError(
+            f"polygon is not simple ({shapely.is_valid_reason(polygon)}): give the corners in order"
+        )
+    if polygon_area(corners) < 0:
+        corners = np.roll(corners[::-1], 1, axis=0)
+    return read_only(corners)
+
+
+def inner_radius(corners: Float[np.ndarray, "n 2"]) -> float:
+    """Radius of the widest circle inside a polygon [m]."""
+    return float(shapely.length(shapely.maximum_inscribed_circle(shapely.Polygon(corners))))
+
+
+def clip_edges(
+    part: Float[np.ndarray, "k 2"], corners: Float[np.ndarray, "n 2"], edges: range | list[int], width: float
+) -> Float[np.ndarray, "m 2"]:
+    """What is left of a convex part at a distance of at least ``width`` [m] from the lines of some edges."""
+    normals = inward_normals(corners)
+    for k in edges:
+        part = clip_polygon(part, normals[k], float(normals[k] @ corners[k]) + width)
+    return part
+
+
+def convex_parts(corners: Float[np.ndarray, "n 2"]) -> list[list[int]]:
+    """Corner indices of convex parts that tile a simple polygon, each counter-clockwise.
+
+    The exact constrained Delaunay triangles are merged across inner diagonals, longest first, wherever
+    the union stays convex.
+    """
+    index_of = {(x, y): k for k, (x, y) in enumerate(corners.tolist())}
+    triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(corners)).geoms
+    parts: list[list[int]] = []
+    for triangle in triangles:
+        indices = [
+            index_of[xy] for xy in shapely.get_coordinates(triangle)[:3].tolist() for xy in [tuple(xy)]
+        ]
+        parts.append(indices if polygon_area(corners[indices]) > 0 else indices[::-1])
+    owner = {edge: part for part in parts for edge in directed_edges(part)}
+    diagonals = [edge for edge in owner if edge[0] < edge[1] and edge[::-1] in owner]
+    diagonals.sort(key=lambda edge: (-np.linalg.norm(corners[edge[0]] - corners[edge[1]]), edge))
+    for i, j in diagonals:
+        left, right = owner[i, j], owner[j, i]
+        if left is right:
+            continue
+        left_from_j = left[left.index(j) :] + left[: left.index(j)]
+        right_from_i = right[right.index(i) :] + right[: right.index(i)]
+        merged = left_from_j + right_from_i[1:-1]
+        if is_convex(corners[merged]):
+            parts = [part for part in parts if part is not left and part is not right] + [merged]
+            owner.update({edge: merged for edge in directed_edges(merged)})
+    return parts
+
+
+def directed_edges(indices: list[int]) -> list[tuple[int, int]]:
+    """The edges of a closed chain of corner indices."""
+    return list(zip(indices, [*indices[1:], indices[0]], strict=True))
+
+
+def sample_prism(rng: np.random.Generator, num_corners: int) -> Prism:
+    """One of the paper's random objects (section 4): corners at random angles on a circle of 10 cm radius.
+
+    The circle's centre lies strictly inside: draws with a gap over 170 or under 12 degrees are rejected.
+
+    Raises:
+        ShapeError: if so many corners cannot keep their smallest gap, or fewer than three are asked for.
+    """
+    most = int(0.5 * 2 * np.pi / SMALLEST_GAP)
+    if not 3 <= num_corners <= most:
+        raise ShapeError(f"sampled polygon with {num_corners} corners: choose 3 to {most}")
+    while True:
+        angles = np.sort(rng.uniform(0.0, 2 * np.pi, num_corners))
+        gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
+        if gaps.min() >= SMALLEST_GAP and gaps.max() <= LARGEST_GAP:
+            return Prism(CIRCLE_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)]))
+
+
+def paper_objects(seed: int = 0, per_corner_count: int = 20) -> list[Prism]:
+    """The paper's object set (section 4): 20 random prisms for each corner count from 3 to 10.
+
+    Each object has its own random stream, so object i can be made again without the others: it is
+    ``sample_prism(np.random.default_rng([seed, i]), CORNER_COUNTS[i // per_corner_count])``.
+    """
+    counts = np.repeat(CORNER_COUNTS, per_corner_count).tolist()
+    return [sample_prism(np.random.default_rng([seed, i]), count) for i, count in enumerate(counts)]
