@@ -101,7 +101,94 @@ class LeverUp:
 def sample_contacts(obj: ObjectModel, rng: np.random.Generator, per_edge: int = 2) -> list[LeverUp]:
     """Lever-ups at uniformly sampled points of every edge (paper, section 4: two on each edge)."""
     return [
-        LeverUp.at_edge(obj, edge, 1.0 - rng.uniform(0.0, 1.0 - 1e-9))
+        LeverUp.at_edge(obj, edge, rng.uniform(np.nextafter(0.0, 1.0), 1.0))
         for edge in range(len(obj.corners))
         for _ in range(per_edge)
     ]
+
+
+@dataclass(frozen=True)
+class ToolPath:
+    """The open-loop path of the blade, always the same in the action frame (paper, section 4).
+
+    The blade waits before the rim, is pushed under it, lifts on an arc about the far side while its pitch
+    follows the object's tilt, and holds. Every phase starts and ends at rest (minimum-jerk time law: Flash and
+    Hogan, 1985). The motion stays in the action frame's x-z plane.
+
+    Raises:
+        ActionError: if a value is out of its range.
+    """
+
+    insertion: float = 0.036
+    """How far the blade tip is pushed under the object, past the contact point [m]."""
+    arc_radius: float = 0.12
+    """Radius of the arc on which the tip is lifted [m]."""
+    sweep: float = 0.81
+    """Angle of that arc [rad]."""
+    pitch: float = 0.40
+    """Pitch of the blade while it is pushed in, tip down [rad]."""
+    pitch_gain: float = 0.13
+    """By how much the pitch grows per angle of the arc."""
+    standoff: float = 0.008
+    """Distance of the tip from the contact point at the start [m]."""
+    clearance: float = 0.0004
+    """Gap between the tip's lower edge and the table [m]."""
+    wait_time: float = 0.1
+    """Time at rest before the blade moves [s]."""
+    insert_time: float = 0.6
+    """Time to push the blade in [s]."""
+    lift_time: float = 1.7
+    """Time to lift [s]."""
+    hold_time: float = 0.55
+    """Time to hold at the end [s]."""
+
+    def __post_init__(self) -> None:
+        limits = {
+            "insertion": (0.0, 0.1),
+            "arc_radius": (0.02, 1.0),
+            "sweep": (0.0, np.pi / 2),
+            "pitch": (0.0, np.pi / 3),
+            "pitch_gain": (-1.0, 2.0),
+            "standoff": (0.0, 0.05),
+            "clearance": (0.0, 0.01),
+            "wait_time": (0.0, 10.0),
+            "insert_time": (0.05, 60.0),
+            "lift_time": (0.05, 60.0),
+            "hold_time": (0.0, 60.0),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ActionError(f"tool path: {name} = {value} is outside {low:g} to {high:g}")
+
+    @property
+    def duration(self) -> float:
+        """Time from start to end [s]."""
+        return self.wait_time + self.insert_time + self.lift_time + self.hold_time
+
+    @property
+    def lift_start(self) -> float:
+        """Time at which the lift begins [s]."""
+        return self.wait_time + self.insert_time
+
+    def at(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3"]:
+        """Blade tip over time.
+
+        Args:
+            times: Times since the start [s]; the path rests before its start and after its end.
+
+        Returns:
+            x and z of the tip's lower edge in the action frame [m] and the blade's pitch [rad], tip down.
+        """
+        inserted = _minimum_jerk((times - self.wait_time) / self.insert_time)
+        angle = self.sweep * _minimum_jerk((times - self.lift_start) / self.lift_time)
+        x = -self.standoff + (self.insertion + self.standoff) * inserted
+        x = x + self.arc_radius * (1 - np.cos(angle))
+        z = self.clearance + self.arc_radius * np.sin(angle)
+        return np.stack([x, z, self.pitch + self.pitch_gain * angle], axis=-1)
+
+
+def _minimum_jerk(phase: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+    """Smooth step from 0 to 1 with zero speed and acceleration at both ends."""
+    s = np.clip(phase, 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2)

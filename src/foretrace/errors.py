@@ -1,0 +1,40 @@
+"""What can go wrong, one class per kind of mistake.
+
+Every message names the offending value and says what to do; the command line prints it as one line.
+"""
+
+
+class ForetraceError(Exception):
+    """Base of every error that foretrace raises on purpose."""
+
+
+class ShapeError(ForetraceError):
+    """An object's geometry cannot be used: too few corners, self-intersection, not watertight, absurd size."""
+
+
+class ActionError(ForetraceError):
+    """A lever-up that cannot be placed on its object, or a tool path that cannot be followed."""
+
+
+class ViewError(ForetraceError):
+    """A top-down view that cannot be made: empty mask, wrong size, object outside the window."""
+
+
+class SimulationError(ForetraceError):
+    """The simulation was asked for something it cannot do, or a renderer is missing."""
+
+
+class DatasetError(ForetraceError):
+    """A data set that is missing, damaged, of another version or made with another configuration."""
+
+
+class TrainingError(ForetraceError):
+    """A training that cannot start: unknown features, a split larger than the data, a folder in use."""
+
+
+class CheckpointError(ForetraceError):
+    """A checkpoint that is missing, of another version, or whose tensors do not fit."""
+
+
+class PredictionError(ForetraceError):
+    """An input that the predictor cannot imagine an effect for."""

@@ -1,0 +1,68 @@
+"""The contract of a physics engine: play one lever-up, report what was seen."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from foretrace.actions import LeverUp, ToolPath
+from foretrace.errors import SimulationError
+from foretrace.interactions.record import Physics
+from foretrace.objects import ObjectModel
+from foretrace.simulation.tool import Tool
+
+ENGINES = ("mujoco",)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an engine saw of one lever-up, in the action frame."""
+
+    times: Float[np.ndarray, " time"]
+    """Sample times [s]."""
+    object_pose: Float[np.ndarray, "time 7"]
+    """Object frame: position [m], quaternion (w, x, y, z)."""
+    tool_pose: Float[np.ndarray, "time 7"]
+    """Blade tip frame: position [m], quaternion (w, x, y, z)."""
+    joints: Float[np.ndarray, "time joints"]
+    """Joint angles of the arm [rad]; no columns for the tool alone."""
+    on_blade: Bool[np.ndarray, " time"]
+    """Whether blade or shaft touched the object."""
+    table_contacts: tuple[Float[np.ndarray, "_ 3"], ...]
+    """Per sample, the points where the object stood on the table, in the object frame [m]."""
+    path_error: float
+    """Largest distance of the blade tip from its planned path [m]."""
+    diverged: bool
+    """Whether the numbers blew up."""
+
+
+class Engine(Protocol):
+    """Plays lever-ups. Implementations are deterministic: equal arguments give equal motions."""
+
+    name: str
+
+    def play(
+        self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics
+    ) -> Motion:
+        """Plays one lever-up from the moment before the blade moves until the end of the path."""
+        ...
+
+
+def make_engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
+    """The engine of a name.
+
+    Args:
+        name: One of ENGINES.
+        embodiment: ``arm`` or ``tool``.
+        timestep: Time step [s].
+        sample_period: Time between recorded samples [s].
+
+    Raises:
+        SimulationError: If there is no such engine.
+    """
+    if name == "mujoco":
+        from foretrace.simulation.mujoco_engine import MujocoEngine
+
+        return MujocoEngine(embodiment, timestep, sample_period)
+    raise SimulationError(f"engine {name!r} is unknown: choose one of {', '.join(ENGINES)}")

@@ -1,0 +1,194 @@
+"""Play the action, judge and record the effect (paper, section 4)."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.metadata import version
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from foretrace.actions import LeverUp, ToolPath
+from foretrace.geometry import quaternion_to_matrix, tilt, transform_points
+from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import ObjectModel
+from foretrace.simulation.engine import Engine, Motion, make_engine
+from foretrace.simulation.tool import Tool
+
+LIFTED_TILT = np.deg2rad(3.0)
+"""An object tilted by more than this counts as lifted [rad]."""
+OFF_SAMPLES = 2
+"""So many samples in a row off the blade are a slip; one alone is a bounce."""
+ROLLED_RISE = 0.25
+"""Rolling lifts the centre of mass by less than this part of its height at rest."""
+CORNER_REACH = 0.004
+"""A table contact belongs to a corner within this distance [m]."""
+SUPPORT_SHARE = 0.5
+"""A support corner carries the object in at least this share of the lifted samples."""
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """How lever-ups are simulated."""
+
+    engine: str = "mujoco"
+    """Physics engine."""
+    embodiment: str = "arm"
+    """``arm``: the whole robot; ``tool``: the blade alone on the same path."""
+    camera: str = "exact"
+    """``exact``: the view from geometry; ``rgbd``: from a rendered depth image."""
+    timestep: float = 0.002
+    """Time step [s]."""
+    sample_period: float = 0.05
+    """Time between recorded samples [s]."""
+    path: ToolPath = field(default_factory=ToolPath)
+    """The blade's path."""
+    tool: Tool = field(default_factory=Tool)
+    """The screwdriver."""
+    physics: Physics = field(default_factory=Physics)
+    """Friction and density."""
+
+
+def simulate_lever_up(
+    obj: ObjectModel,
+    action: LeverUp,
+    config: SimulationConfig = SimulationConfig(),
+    *,
+    seed: int = 0,
+    id: int = 0,
+) -> Interaction:
+    """Simulates one lever-up and records it.
+
+    Args:
+        obj: The object.
+        action: Where and which way it is levered up.
+        config: How.
+        seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
+        id: Number of the interaction within its data set.
+
+    Returns:
+        The interaction; its outcome is ``failed`` and its trajectories are empty if the simulation diverged.
+
+    Raises:
+        SimulationError: If engine, embodiment or camera is unknown.
+        ActionError: If the arm cannot follow the path.
+        ViewError: If the object does not fit in the view.
+    """
+    engine = _engine(config.engine, config.embodiment, config.timestep, config.sample_period)
+    if config.camera == "exact":
+        view = TopDownView.of(obj, action)
+    else:
+        from foretrace.simulation.camera import observe_view
+
+        view = observe_view(obj, action, config.camera, seed=seed)
+    motion = engine.play(obj, action, config.path, config.tool, config.physics)
+    return Interaction(
+        object=obj,
+        action=action,
+        view=view,
+        effect=judge(motion, obj, action, config.physics),
+        physics=config.physics,
+        provenance=Provenance(
+            source="simulated",
+            engine=engine.name,
+            embodiment=config.embodiment,
+            seed=seed,
+            versions=_versions(engine.name),
+        ),
+        id=id,
+    )
+
+
+def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -> Effect:
+    """Turns what the engine saw into the record of an effect: outcome, slip and support points.
+
+    Args:
+        motion: The engine's motion.
+        obj: The object.
+        action: The lever-up.
+        physics: Friction and density.
+    """
+    unknown = np.full((2, 2), np.nan)
+    if motion.diverged:
+        empty = np.empty((0, 7))
+        joints = np.empty((0, motion.joints.shape[1]))
+        return Effect(np.empty(0), empty, np.empty((0, 3)), empty, joints, unknown, (), Outcome.FAILED)
+    com_in_object = obj.mass_properties(physics.density).com
+    rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
+    com = motion.object_pose[:, :3] + rotation @ com_in_object
+    angle = tilt(rotation)
+    lifted = angle > LIFTED_TILT
+    slip = _slip_index(lifted, motion.on_blade)
+    outcome = _outcome(angle, com[:, 2], slip)
+    corners, points = (), unknown
+    end = len(com) if slip is None else slip
+    if lifted[:end].any():
+        counts = _corner_counts(motion, obj, np.flatnonzero(lifted[:end]))
+        shares = counts / max(int(lifted[:end].sum()), 1)
+        corners = tuple(int(k) for k in np.flatnonzero(shares >= SUPPORT_SHARE))
+        busiest = np.argsort(-counts, kind="stable")[:2]
+        if (counts[busiest] > 0).all():
+            at_rest = np.column_stack([obj.support_corners[np.sort(busiest)], np.zeros(2)])
+            points = transform_points(action.T_action_object, at_rest)[:, :2]
+    return Effect(
+        times=motion.times,
+        pose_trajectory=motion.object_pose,
+        com_trajectory=com,
+        tool_trajectory=motion.tool_pose,
+        joint_trajectory=motion.joints,
+        support_points=points,
+        support_corners=corners,
+        outcome=outcome,
+        slip_index=slip,
+        path_error=motion.path_error,
+    )
+
+
+def _slip_index(lifted: Bool[np.ndarray, " time"], on_blade: Bool[np.ndarray, " time"]) -> int | None:
+    """First sample of the first lasting loss of contact after the object was first lifted."""
+    if not lifted.any():
+        return None
+    off = ~on_blade
+    off[: int(lifted.argmax())] = False
+    lasting = off.copy()
+    for k in range(1, OFF_SAMPLES):
+        # At the record's end the missing samples count as off.
+        lasting &= np.append(off[k:], np.ones(k, dtype=bool))
+    return int(lasting.argmax()) if lasting.any() else None
+
+
+def _outcome(angle: Float[np.ndarray, " time"], com_z: Float[np.ndarray, " time"], slip: int | None) -> Outcome:
+    rise = com_z.max() - com_z[0]
+    if angle.max() <= LIFTED_TILT:
+        return Outcome.MISSED
+    if angle.max() > np.pi / 4 and rise < ROLLED_RISE * com_z[0]:
+        return Outcome.ROLLED
+    if angle.max() > np.pi / 2:
+        return Outcome.TUMBLED
+    return Outcome.LEVERED if slip is None else Outcome.SLIPPED
+
+
+def _corner_counts(
+    motion: Motion, obj: ObjectModel, samples: Int[np.ndarray, " samples"]
+) -> Int[np.ndarray, " corners"]:
+    """In how many of the given samples each corner of the object stood on the table."""
+    counts = np.zeros(len(obj.corners), dtype=int)
+    # With growing tilt the object passes from the bevel's inner to its outer edge: a corner is the segment between.
+    start, along = obj.support_corners, obj.corners - obj.support_corners
+    length2 = np.maximum((along**2).sum(axis=1), 1e-18)
+    for i in samples:
+        points = motion.table_contacts[i][:, None, :2] - start  # (contacts, corners, 2)
+        t = np.clip((points * along).sum(axis=-1) / length2, 0.0, 1.0)
+        distance = np.linalg.norm(points - t[..., None] * along, axis=-1)
+        counts += (distance < CORNER_REACH).any(axis=0)
+    return counts
+
+
+@lru_cache(maxsize=4)
+def _engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
+    return make_engine(name, embodiment, timestep, sample_period)
+
+
+@lru_cache(maxsize=4)
+def _versions(engine: str) -> dict[str, str]:
+    return {name: version(name) for name in ("foretrace", "numpy", engine)}
