@@ -1,10 +1,24 @@
-"""Interactions on disk and in memory."""
+"""Interactions in memory: `Dataset` reads them from disk, `InteractionBatch` is what learners read."""
 
+import json
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 from jaxtyping import Bool, Float, Int
+
+from foretrace.actions import LeverUp
+from foretrace.errors import DatasetError
+from foretrace.interactions import storage
+from foretrace.interactions.record import Interaction, Outcome
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import ObjectModel, object_from_dict
 
 
 @dataclass(frozen=True)
@@ -51,3 +65,235 @@ class InteractionBatch:
         """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all."""
         kept = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "times"}
         return replace(self, **kept)
+
+    @classmethod
+    def from_interactions(cls, interactions: Sequence[Interaction]) -> "InteractionBatch":
+        """Interactions as arrays; objects that are equal get equal ``object_ids``, counted from 0.
+
+        Raises:
+            DatasetError: Two of them were sampled at different times.
+        """
+        descriptions = [json.dumps(interaction.object.to_dict()) for interaction in interactions]
+        numbers = {description: k for k, description in enumerate(dict.fromkeys(descriptions))}
+        rows = [
+            storage.encode(interaction, numbers[description])
+            for interaction, description in zip(interactions, descriptions, strict=True)
+        ]
+        known = dict(zip(descriptions, (interaction.object for interaction in interactions), strict=True))
+        return _batch(storage.to_table(rows), known)
+
+    @classmethod
+    def from_views(
+        cls,
+        views: Sequence[TopDownView],
+        times: Float[np.ndarray, " time"] | None = None,
+        corners: Sequence[Float[np.ndarray, "_ 2"]] | None = None,
+    ) -> "InteractionBatch":
+        """Actions whose effect is still to be imagined: everything that was not seen is NaN, or empty.
+
+        Args:
+            views: What the camera sees of each object, in the action frame.
+            times: Times at which the effect will be imagined [s]; by default none.
+            corners: Corners of each object in the action frame [m], if known.
+        """
+        n, times = len(views), np.zeros(0) if times is None else times
+        unknown = np.full(n, np.nan)
+        corners = [np.zeros((0, 2))] * n if corners is None else corners
+        return cls(
+            ids=np.arange(n),
+            mask=np.array([view.mask for view in views], dtype=bool).reshape(n, *_VIEW_SHAPE),
+            height=np.array([view.height for view in views], dtype=np.float32).reshape(n, *_VIEW_SHAPE),
+            corners=_padded(corners, 2),
+            num_corners=np.array([len(c) for c in corners], dtype=np.int64),
+            object_ids=np.arange(n),
+            times=times,
+            com=np.full((n, len(times), 3), np.nan),
+            pose=np.full((n, len(times), 7), np.nan),
+            length=np.zeros(n, dtype=np.int64),
+            slip_index=np.zeros(n, dtype=np.int64),
+            support_points=np.full((n, 2, 2), np.nan),
+            outcome=np.full(n, "", dtype="<U8"),
+            density=unknown,
+            friction=unknown,
+            tool_friction=unknown,
+        )
+
+
+class Dataset:
+    """Interactions in the order of their ids; open one with `Dataset.open`.
+
+    ``dataset[3]`` is the fourth interaction; ``dataset[10:20]`` and ``dataset[indices]`` are data sets again.
+    """
+
+    def __init__(self, table: pa.Table, manifest: Mapping[str, Any], path: Path):
+        self.table = table
+        """The rows as a pyarrow table; `storage.COLUMNS` explains its columns."""
+        self.manifest = manifest
+        """What the folder says about itself: configuration, versions, units, shards."""
+        self.path = path
+        """The folder that it was read from."""
+        self._objects: dict[str, ObjectModel] = {}
+
+    @classmethod
+    def open(cls, path: str | Path, failed: bool = False) -> "Dataset":
+        """Read a data set, whole, into memory; checksums are verified on the way.
+
+        Args:
+            path: The folder written by ``foretrace simulate``.
+            failed: Keep the failed simulations too; they have no effect to learn from.
+
+        Raises:
+            DatasetError: Nothing there, another format version, or a missing or corrupt shard.
+        """
+        path = Path(path)
+        manifest = storage.read_manifest(path)
+        shards = sorted(manifest["shards"].items())
+        tables = [storage.read_shard(path, name, entry.get("sha256"))[0] for name, entry in shards]
+        if missing := storage.missing_shards(manifest):
+            warnings.warn(
+                f"{path} is not finished: {len(missing)} of {len(missing) + len(shards)} shards are missing; "
+                "the same `foretrace simulate` command goes on where it stopped",
+                stacklevel=2,
+            )
+        dataset = cls(pa.concat_tables([storage.SCHEMA.empty_table(), *tables]), manifest, path)
+        return dataset if failed else dataset.where(outcome=[o for o in Outcome if o != Outcome.FAILED])
+
+    def __len__(self) -> int:
+        return self.table.num_rows
+
+    def __getitem__(self, rows: Any) -> Any:
+        if isinstance(rows, int | np.integer):
+            if not -len(self) <= rows < len(self):
+                raise IndexError(f"interaction {rows} of {len(self)}")
+            row = self.table.slice(rows % len(self), 1).to_pylist()[0]
+            return storage.decode(row, self._object(row["object"]))
+        return self._view(np.arange(len(self))[rows])
+
+    def __iter__(self) -> Iterator[Interaction]:
+        return (self[k] for k in range(len(self)))
+
+    def where(self, **conditions: Any) -> "Dataset":
+        """The interactions that meet every condition.
+
+        Args:
+            **conditions: For a column (``outcome``, ``num_corners``, ``object_id``...): the value that it
+                must have, several allowed values, or a function from the column (an array) to booleans.
+
+        Raises:
+            DatasetError: There is no such column.
+        """
+        kept = np.ones(len(self), dtype=bool)
+        for name, wanted in conditions.items():
+            scalars = [f.name for f in storage.SCHEMA if not pa.types.is_nested(f.type)]
+            if name not in scalars:
+                raise DatasetError(f"no column {name!r} to filter by; there are {', '.join(scalars)}")
+            column = self.table[name].to_numpy()
+            if callable(wanted):
+                kept &= np.asarray(wanted(column), dtype=bool)
+            else:
+                several = isinstance(wanted, list | tuple | set | frozenset | range | np.ndarray)
+                kept &= np.isin(column, list(wanted) if several else [wanted])
+        return self if kept.all() else self._view(np.flatnonzero(kept))
+
+    def with_id(self, id: int) -> Interaction:
+        """The interaction of that number.
+
+        Raises:
+            DatasetError: It is not among these.
+        """
+        found = np.flatnonzero(self.table["id"].to_numpy() == id)
+        if len(found) == 0:
+            raise DatasetError(f"{self.path} has no interaction {id} among the {len(self)} selected")
+        return self[found[0]]
+
+    def batch(self) -> InteractionBatch:
+        """All of them as arrays.
+
+        Raises:
+            DatasetError: Two of them were sampled at different times.
+        """
+        for description in self.table["object"].unique().to_pylist():
+            self._object(description)
+        return _batch(self.table, self._objects)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The rows as a data frame, trajectories flattened, images packed."""
+        return self.table.to_pandas()
+
+    def outcomes(self) -> dict[str, int]:
+        """How often each outcome occurs, in the order of `Outcome`."""
+        names = self.table["outcome"].to_pylist()
+        return {str(outcome): names.count(outcome) for outcome in Outcome if outcome in names}
+
+    def _view(self, rows: np.ndarray) -> "Dataset":
+        view = Dataset(self.table.take(pa.array(rows, type=pa.int64())), self.manifest, self.path)
+        view._objects = self._objects
+        return view
+
+    def _object(self, description: str) -> ObjectModel:
+        if description not in self._objects:
+            self._objects[description] = object_from_dict(json.loads(description))
+        return self._objects[description]
+
+
+_VIEW_SHAPE = (storage.VIEW_SIZE, storage.VIEW_SIZE)
+
+
+def _padded(arrays: Sequence[np.ndarray], width: int, longest: int | None = None) -> np.ndarray:
+    """(n, longest, width) from arrays of (k, width), NaN past the end of each."""
+    longest = max((len(a) for a in arrays), default=0) if longest is None else longest
+    padded = np.full((len(arrays), longest, width), np.nan)
+    for k, array in enumerate(arrays):
+        padded[k, : len(array)] = array
+    return padded
+
+
+def _lists(table: pa.Table, name: str, width: int) -> list[np.ndarray]:
+    """A list column as one (k, width) array per row, without a copy."""
+    column = table[name].combine_chunks()
+    flat, offsets = column.values.to_numpy(zero_copy_only=False), column.offsets.to_numpy()
+    return [flat[a:b].reshape(-1, width) for a, b in pairwise(offsets)]
+
+
+def _common_times(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
+    """The longest row's sample times, and how many samples each row has."""
+    times = [row[:, 0] for row in _lists(table, "times", 1)]
+    length = np.array([len(row) for row in times], dtype=np.int64)
+    longest = max(times, key=len, default=np.zeros(0)).copy()
+    for id, row in zip(table["id"].to_pylist(), times, strict=True):
+        if not np.allclose(row, longest[: len(row)], rtol=0, atol=1e-9):
+            raise DatasetError(f"interaction {id} was sampled at other times than the rest; batch it apart")
+    return longest, length
+
+
+def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:
+    """Each object's corners in its action's frame at rest [m]."""
+    corners = []
+    columns = (table[name].to_pylist() for name in ("object", "contact", "direction"))
+    for description, contact, direction in zip(*columns, strict=True):
+        T_action_object = LeverUp(np.array(contact), np.array(direction)).T_action_object
+        corners.append(objects[description].corners @ T_action_object[:2, :2].T + T_action_object[:2, 3])
+    return corners
+
+
+def _batch(table: pa.Table, objects: Mapping[str, ObjectModel]) -> InteractionBatch:
+    times, length = _common_times(table)
+    corners = _corners_in_action(table, objects)
+    slip_index = table["slip_index"].to_numpy()
+    physics = {name: table[name].to_numpy() for name in ("density", "friction", "tool_friction")}
+    return InteractionBatch(
+        ids=table["id"].to_numpy(),
+        mask=storage.unpack_masks(table["mask"].to_pylist()),
+        height=storage.unpack_heights(table["height"].to_pylist()),
+        corners=_padded(corners, 2),
+        num_corners=np.array([len(c) for c in corners], dtype=np.int64),
+        object_ids=table["object_id"].to_numpy(),
+        times=times,
+        com=_padded(_lists(table, "com_trajectory", 3), 3, len(times)),
+        pose=_padded(_lists(table, "pose_trajectory", 7), 7, len(times)),
+        length=length,
+        slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
+        support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
+        outcome=np.array(table["outcome"].to_pylist(), dtype="<U8"),
+        **physics,
+    )

@@ -1,0 +1,147 @@
+"""Is a data set whole and sound? What is not, and what of it can be repaired."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from foretrace.errors import DatasetError
+from foretrace.interactions import storage
+from foretrace.interactions.record import Outcome
+
+QUATERNION_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with a data set."""
+
+    file: str
+    """The file that it concerns."""
+    problem: str
+    """What is wrong, and what can be done."""
+    repaired: bool = False
+    """Whether it has been put right."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What `examine` found."""
+
+    findings: tuple[Finding, ...]
+    """Everything that is wrong; empty for a sound data set."""
+    num_interactions: int
+    """Interactions in readable shards."""
+    outcomes: dict[str, int]
+    """How often each outcome occurs, failed simulations included."""
+
+
+def examine(path: str | Path, repair: bool = False) -> Diagnosis:
+    """Check checksums, schema, numbers, ids and stray files of a data set.
+
+    Args:
+        path: The data set's folder.
+        repair: Remove what an interrupted run left behind, set corrupt shards aside so that
+            ``foretrace simulate`` makes them again, and enter whole shards that merely miss their checksum.
+
+    Raises:
+        DatasetError: There is no data set, or its manifest cannot be read.
+    """
+    path = Path(path)
+    if not repair:
+        return _examine(path, repair=False)
+    storage.read_manifest(path)  # before the lock, which would leave its file in any folder
+    with storage.sole_writer(path):
+        return _examine(path, repair=True)
+
+
+def _examine(path: Path, repair: bool) -> Diagnosis:
+    manifest = storage.read_manifest(path)
+    findings = list(_stray_files(path, repair))
+    tables: dict[str, pa.Table] = {}
+    on_disk = {f.relative_to(path).as_posix() for f in path.glob(f"{storage.SHARD_FOLDER}/shard-*.parquet")}
+    for name in sorted(on_disk | set(manifest["shards"])):
+        entry = manifest["shards"].get(name, {})
+        try:
+            table, content = storage.read_shard(path, name, entry.get("sha256"))
+        except DatasetError as error:
+            findings.append(_set_aside(path, name, manifest, str(error), repair))
+            continue
+        tables[name] = table
+        findings += _unsound_numbers(name, table)
+        if "sha256" not in entry:
+            findings.append(Finding(name, "no checksum in the manifest (an interrupted run)", repair))
+            if repair:
+                manifest["shards"][name] = storage.shard_entry(content, table)
+    findings += _unsound_ids(tables, manifest)
+    if repair:
+        storage.write_manifest(path, manifest)
+    outcomes = [outcome for table in tables.values() for outcome in table["outcome"].to_pylist()]
+    counts = {str(outcome): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
+    return Diagnosis(tuple(findings), len(outcomes), counts)
+
+
+def _stray_files(path: Path, repair: bool) -> Iterator[Finding]:
+    for file in sorted([*path.glob("*.tmp"), *(path / storage.SHARD_FOLDER).glob("*.tmp")]):
+        if repair:
+            file.unlink()
+        yield Finding(str(file.relative_to(path)), "temporary file of an interrupted run", repair)
+
+
+def _set_aside(path: Path, name: str, manifest: dict, problem: str, repair: bool) -> Finding:
+    if repair:
+        manifest["shards"].pop(name, None)
+        if (path / name).exists():
+            (path / name).replace(path / f"{name}.corrupt")
+        problem = f"{problem.split(';')[0]}; set aside, `foretrace simulate` makes it again"
+    return Finding(name, problem, repair)
+
+
+def _unsound_numbers(name: str, table: pa.Table) -> Iterator[Finding]:
+    """NaN, infinities, wrong lengths and quaternions that are no rotations."""
+    scalars = [f.name for f in storage.SCHEMA if pa.types.is_floating(f.type)]
+    columns = [*storage.TRAJECTORIES, "joint_trajectory", "num_joints", "id", "outcome", *scalars]
+    for row in table.select(columns).to_pylist():
+        who = f"interaction {row['id']}"
+        num_samples = len(row["times"])
+        widths = {**storage.TRAJECTORIES, "joint_trajectory": row["num_joints"]}
+        if num_samples == 0 and row["outcome"] != Outcome.FAILED:
+            yield Finding(name, f"{who} has no samples although its outcome is {row['outcome']}")
+        if row["outcome"] not in list(Outcome):
+            yield Finding(name, f"{who} has the unknown outcome {row['outcome']!r}")
+        for column, width in widths.items():
+            values = np.array(row[column], dtype=float)
+            if len(values) != num_samples * width:
+                yield Finding(name, f"{who}: {column} has {len(values)} numbers for {num_samples} samples")
+            elif not np.isfinite(values).all():
+                yield Finding(name, f"{who}: {column} holds NaN or infinity")
+            elif width == 7:
+                norms = np.linalg.norm(values.reshape(-1, 7)[:, 3:], axis=1)
+                worst = np.abs(norms - 1).max(initial=0)
+                if worst > QUATERNION_TOLERANCE:
+                    yield Finding(name, f"{who}: a quaternion of {column} has a norm {worst:.2g} away from 1")
+        if unknown := [scalar for scalar in scalars if row[scalar] is None or not np.isfinite(row[scalar])]:
+            yield Finding(name, f"{who}: {', '.join(unknown)} is not a number")
+        if np.any(np.diff(row["times"]) <= 0):
+            yield Finding(name, f"{who}: its times do not rise")
+
+
+def _unsound_ids(tables: dict[str, pa.Table], manifest: dict) -> Iterator[Finding]:
+    """Duplicate ids, ids in the wrong shard, and shards that are still to come."""
+    size, num_trials = manifest["shard_size"], manifest["num_trials"]
+    starts = {storage.shard_name(k): start for k, start in enumerate(range(0, num_trials, size))}
+    seen: set[int] = set()
+    for name, table in tables.items():
+        ids = table["id"].to_pylist()
+        if twice := sorted({id for id in ids if id in seen or ids.count(id) > 1}):
+            yield Finding(name, f"duplicate ids {twice}")
+        seen.update(ids)
+        if name not in starts:
+            yield Finding(name, f"does not belong to a data set of {num_trials} interactions; remove it")
+        elif sorted(set(ids)) != list(range(starts[name], min(starts[name] + size, num_trials))):
+            yield Finding(name, f"its ids do not run from {starts[name]} on without gaps")
+    for name in starts:
+        if name not in tables:
+            yield Finding(name, "not there; the same `foretrace simulate` command makes it")

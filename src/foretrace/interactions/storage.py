@@ -1,0 +1,299 @@
+"""Interactions on disk: Parquet shards (one row per interaction) and a JSON manifest beside them.
+
+A shard appears under its name only when it is complete (written aside, synchronised, renamed); its checksum
+enters the manifest right after. So a crash at any moment leaves whole shards, at most one without a checksum.
+Positions and angles are kept as float64, exactly as observed; the height map in steps of 0.1 mm.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from foretrace.actions import LeverUp
+from foretrace.errors import DatasetError
+from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
+from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
+from foretrace.objects import ObjectModel, object_from_dict
+
+FORMAT = "foretrace-interactions"
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+SHARD_FOLDER = "shards"
+LOCK = ".lock"
+HEIGHT_STEP = 1e-4
+"""Resolution of stored height maps [m]."""
+
+_FLOATS = pa.list_(pa.float64())
+COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
+    "id": (pa.int64(), "", "number of the interaction within its data set"),
+    "object_id": (pa.int64(), "", "equal numbers are the same object"),
+    "num_corners": (pa.int64(), "", "corners of the object's outline"),
+    "object": (pa.string(), "m", "the object in its own frame, as JSON"),
+    "contact": (_FLOATS, "m", "contact point in the object frame (2)"),
+    "direction": (_FLOATS, "", "unit direction of the action in the object frame (2)"),
+    "outcome": (pa.string(), "", "what became of the object"),
+    "slip_index": (pa.int64(), "", "first sample off the blade after having been lifted, or null"),
+    "times": (_FLOATS, "s", "sample times"),
+    "pose_trajectory": (_FLOATS, "m", "object frame: position, quaternion w x y z (time x 7)"),
+    "com_trajectory": (_FLOATS, "m", "centre of mass (time x 3)"),
+    "tool_trajectory": (_FLOATS, "m", "blade tip: position, quaternion w x y z (time x 7)"),
+    "joint_trajectory": (_FLOATS, "rad", "joint angles (time x num_joints)"),
+    "num_joints": (pa.int64(), "", "columns of joint_trajectory, 0 when the tool moved alone"),
+    "support_points": (_FLOATS, "m", "the two corners turned about (2 x 2), NaN where not observed"),
+    "support_corners": (pa.list_(pa.int64()), "", "indices of the corners that stood on the table"),
+    "path_error": (pa.float64(), "m", "largest distance of the blade tip from its planned path"),
+    "mask": (pa.binary(), "", "top-down mask, bits packed row by row"),
+    "height": (pa.binary(), "0.1 mm", "top-down height map, little-endian uint16 row by row"),
+    "metres_per_pixel": (pa.float64(), "m", "scale of mask and height"),
+    "density": (pa.float64(), "kg/m^3", "density of the object"),
+    "friction": (pa.float64(), "", "friction coefficient between object and table"),
+    "tool_friction": (pa.float64(), "", "friction coefficient between object and blade"),
+    "source": (pa.string(), "", "simulated or recorded"),
+    "engine": (pa.string(), "", "physics engine, empty for a recording"),
+    "embodiment": (pa.string(), "", "arm or tool"),
+    "seed": (pa.int64(), "", "seed of this interaction's random draws"),
+    "versions": (pa.string(), "", "versions that shaped the numbers, as JSON"),
+}
+"""Every column: type, unit, meaning. Vectors are in the action frame unless their meaning says otherwise."""
+SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
+TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
+"""Numbers per sample of each trajectory column; the joints' count is a column of its own."""
+
+
+def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
+    """One interaction as one row.
+
+    Args:
+        interaction: What to store. Of a failed simulation no trajectory is kept.
+        object_id: Number of its object; equal numbers are the same object.
+    """
+    effect, action, view = interaction.effect, interaction.action, interaction.view
+    kept = slice(0, 0) if effect.outcome == Outcome.FAILED else slice(None)
+    return {
+        "id": interaction.id,
+        "object_id": object_id,
+        "num_corners": len(interaction.object.corners),
+        "object": json.dumps(interaction.object.to_dict()),
+        "contact": np.asarray(action.contact, dtype=float),
+        "direction": np.asarray(action.direction, dtype=float),
+        "outcome": str(effect.outcome),
+        "slip_index": effect.slip_index,
+        **{name: np.ravel(getattr(effect, name)[kept]) for name in (*TRAJECTORIES, "joint_trajectory")},
+        "num_joints": effect.joint_trajectory.shape[1],
+        "support_points": np.ravel(effect.support_points),
+        "support_corners": list(effect.support_corners),
+        "path_error": effect.path_error,
+        "mask": np.packbits(view.mask).tobytes(),
+        "height": np.rint(np.clip(view.height / HEIGHT_STEP, 0, 65535)).astype("<u2").tobytes(),
+        "metres_per_pixel": view.metres_per_pixel,
+        **asdict(interaction.physics),
+        **asdict(interaction.provenance),
+        "versions": json.dumps(interaction.provenance.versions, sort_keys=True),
+    }
+
+
+def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> Interaction:
+    """The interaction in one row; ``known_object`` saves building the same object again."""
+    arrays = {name: np.array(row[name], float).reshape(-1, width) for name, width in TRAJECTORIES.items()}
+    times = arrays.pop("times")[:, 0]
+    effect = Effect(
+        times=times,
+        **arrays,
+        joint_trajectory=np.array(row["joint_trajectory"], float).reshape(len(times), row["num_joints"]),
+        support_points=np.array(row["support_points"], float).reshape(2, 2),
+        support_corners=tuple(row["support_corners"]),
+        outcome=Outcome(row["outcome"]),
+        slip_index=row["slip_index"],
+        path_error=row["path_error"],
+    )
+    return Interaction(
+        object=known_object if known_object is not None else object_from_dict(json.loads(row["object"])),
+        action=LeverUp(contact=np.array(row["contact"]), direction=np.array(row["direction"])),
+        view=TopDownView(
+            mask=unpack_masks([row["mask"]])[0],
+            height=unpack_heights([row["height"]])[0],
+            metres_per_pixel=row["metres_per_pixel"],
+        ),
+        effect=effect,
+        physics=Physics(**{name: row[name] for name in ("density", "friction", "tool_friction")}),
+        provenance=Provenance(
+            **{name: row[name] for name in ("source", "engine", "embodiment", "seed")},
+            versions=json.loads(row["versions"]),
+        ),
+        id=row["id"],
+    )
+
+
+def unpack_masks(packed: Sequence[bytes]) -> np.ndarray:
+    """(n, 128, 128) masks from their stored form."""
+    bits = np.frombuffer(b"".join(packed), dtype=np.uint8)
+    return np.unpackbits(bits).astype(bool).reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
+
+
+def unpack_heights(packed: Sequence[bytes]) -> np.ndarray:
+    """(n, 128, 128) float32 height maps [m] from their stored form."""
+    steps = np.frombuffer(b"".join(packed), dtype="<u2")
+    lookup = (np.arange(65536) * HEIGHT_STEP).astype(np.float32)  # 200 steps are 0.02 exactly
+    return lookup[steps].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
+
+
+def to_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
+    """Rows from `encode` as one table."""
+    columns = [pa.array([row[f.name] for row in rows], type=f.type) for f in SCHEMA]
+    return pa.Table.from_arrays(columns, schema=SCHEMA)
+
+
+def shard_name(index: int) -> str:
+    """Name of a shard within the data set's folder, ``shards/shard-00000.parquet``."""
+    return f"{SHARD_FOLDER}/shard-{index:05d}.parquet"
+
+
+@contextmanager
+def sole_writer(folder: Path) -> Iterator[None]:
+    """Hold the data set's lock, which the system releases even when the process is killed.
+
+    Raises:
+        DatasetError: Another process is writing there.
+    """
+    with open(folder / LOCK, "w") as lock:
+        if os.name == "posix":
+            import fcntl
+
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise DatasetError(f"another foretrace writes to {folder}; wait until it is done") from error
+        yield
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that it is either whole or not there, even if the machine loses power."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    with open(temporary, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+    if os.name == "posix":  # the new name itself must reach the disk too
+        folder = os.open(path.parent, os.O_RDONLY)
+        os.fsync(folder)
+        os.close(folder)
+
+
+def write_shard(folder: Path, name: str, table: pa.Table) -> dict[str, Any]:
+    """Write one shard; returns its entry for the manifest (checksum and number of rows)."""
+    buffer = pa.BufferOutputStream()
+    pq.write_table(table.combine_chunks(), buffer, compression="zstd", use_dictionary=False)
+    content = buffer.getvalue().to_pybytes()
+    write_atomically(folder / name, content)
+    return shard_entry(content, table)
+
+
+def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
+    """What the manifest says about a shard."""
+    return {"sha256": hashlib.sha256(content).hexdigest(), "rows": table.num_rows}
+
+
+def read_shard(folder: Path, name: str, sha256: str | None = None) -> tuple[pa.Table, bytes]:
+    """A shard as a table, and its bytes.
+
+    Args:
+        folder: The data set's folder.
+        name: The shard's name in the manifest.
+        sha256: The checksum that it must have, or None to accept any.
+
+    Raises:
+        DatasetError: The file is missing, damaged, or of another schema.
+    """
+    path = folder / name
+    remedy = f"`foretrace doctor {folder} --repair` sets it aside, then `foretrace simulate` makes it again"
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"shard {path} cannot be read ({error.strerror}); {remedy}") from error
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+        raise DatasetError(f"shard {path} is corrupt: its checksum is not the manifest's; {remedy}")
+    try:
+        table = pq.read_table(pa.BufferReader(content))
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error
+    if not table.schema.equals(SCHEMA):
+        found, wanted = ({field.name: field.type for field in schema} for schema in (table.schema, SCHEMA))
+        odd = ", ".join(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
+        raise DatasetError(f"shard {path} has another schema (differs in {odd}); {remedy}")
+    return table, content
+
+
+def new_manifest(
+    configuration: Mapping[str, Any], num_trials: int, shard_size: int, versions: Mapping[str, str]
+) -> dict:
+    """The manifest of a data set that has no shard yet.
+
+    Args:
+        configuration: Everything that shapes the rows, JSON-able.
+        num_trials: Interactions in the finished data set.
+        shard_size: Interactions per shard.
+        versions: Versions of the software that makes the rows.
+    """
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "configuration": dict(configuration),
+        "num_trials": num_trials,
+        "shard_size": shard_size,
+        "versions": dict(versions),
+        "columns": {
+            name: {"type": str(kind), "unit": unit, "meaning": meaning}
+            for name, (kind, unit, meaning) in COLUMNS.items()
+        },
+        "shards": {},
+    }
+
+
+def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Replace the manifest, atomically."""
+    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a data set.
+
+    Raises:
+        DatasetError: No data set is there, its manifest is damaged, or it is of another format version.
+    """
+    path = folder / MANIFEST
+    remedy = f"make one with `foretrace simulate --out {folder}`"
+    if not folder.is_dir():
+        raise DatasetError(f"no data set at {folder}: no such folder; {remedy}")
+    if not path.is_file():
+        raise DatasetError(f"{folder} is not a data set: it has no {MANIFEST}; {remedy}")
+    try:
+        manifest = json.loads(path.read_text())
+        version = manifest["format_version"]
+        complete = manifest["format"] == FORMAT and isinstance(manifest["shards"], dict)
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{path} is damaged ({error!r}); simulate again into a new folder") from error
+    if version != FORMAT_VERSION:
+        raise DatasetError(
+            f"{path} has format version {version}, this foretrace reads version {FORMAT_VERSION}: "
+            "use the foretrace that wrote it, or simulate again into a new folder"
+        )
+    if not complete:
+        raise DatasetError(f"{path} is not a manifest of {FORMAT}")
+    return manifest
+
+
+def missing_shards(manifest: Mapping[str, Any]) -> list[str]:
+    """Names of the shards that the finished data set would have and that the manifest does not list yet."""
+    count = -(-manifest["num_trials"] // manifest["shard_size"])
+    return [name for name in map(shard_name, range(count)) if name not in manifest["shards"]]
