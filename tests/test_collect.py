@@ -1,0 +1,270 @@
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import factories
+from foretrace.errors import DatasetError, SimulationError
+from foretrace.interactions import storage
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.doctor import examine
+from foretrace.interactions.record import Interaction, Outcome
+from foretrace.simulation import collect as collecting
+from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
+
+SMALL = CollectConfig(objects=16)
+"""208 trials: three shards."""
+
+
+def fake_trial(config: CollectConfig, id: int) -> Interaction:
+    """A stand-in for the physics: quick, and different for every trial; every 40th simulation diverges."""
+    obj, action, seed = trial(config, id)
+    made = factories.fake_lever_up(obj, action, id=id, seed=seed)
+    outcome = Outcome.FAILED if id % 40 == 39 else Outcome.LEVERED
+    return replace(made, effect=replace(made.effect, outcome=outcome))
+
+
+def slow_trial(config: CollectConfig, id: int) -> Interaction:
+    time.sleep(0.02)
+    return fake_trial(config, id)
+
+
+def reluctant_trial(config: CollectConfig, id: int) -> Interaction:
+    if id == 150:
+        raise SimulationError("no engine by that name")
+    return fake_trial(config, id)
+
+
+def interrupted_trial(config: CollectConfig, id: int) -> Interaction:
+    if id == 150:
+        raise KeyboardInterrupt
+    return fake_trial(config, id)
+
+
+def torch_free_trial(config: CollectConfig, id: int) -> Interaction:
+    assert "torch" not in sys.modules
+    assert os.environ["OMP_NUM_THREADS"] == "1"
+    return fake_trial(config, id)
+
+
+def quiet() -> Console:
+    return Console(quiet=True)
+
+
+def shards_of(folder: Path) -> dict[str, str]:
+    """Checksum of every shard on disk."""
+    files = sorted((folder / storage.SHARD_FOLDER).iterdir())
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("reference") / "data"
+    collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
+    return folder
+
+
+def test_the_papers_trials_are_2080():
+    config = CollectConfig()
+    assert num_trials(config) == 2080
+    counts = [collecting.num_corners(k) for k in range(config.objects)]
+    assert [counts.count(n) for n in range(3, 11)] == [20] * 8
+    located = [collecting._locate(config, id) for id in range(2080)]
+    assert located == [(k, contact) for k in range(160) for contact in range(2 * counts[k])]
+
+
+@pytest.mark.parametrize("objects", [1, 3, 8, 13])
+def test_any_number_of_objects_is_spread_over_the_corner_counts(objects):
+    config = CollectConfig(objects=objects)
+    counts = [collecting.num_corners(k) for k in range(objects)]
+    assert num_trials(config) == 2 * sum(counts)
+    assert max(map(counts.count, counts)) - min(map(counts.count, counts)) <= 1
+    obj, _, _ = trial(config, num_trials(config) - 1)
+    assert len(obj.corners) == counts[-1]
+    with pytest.raises(SimulationError, match=f"no trial {num_trials(config)}"):
+        trial(config, num_trials(config))
+
+
+def test_every_edge_is_levered_twice_and_trials_are_reproducible():
+    config = CollectConfig(objects=8, seed=5)
+    normals = []
+    for id in range(6):  # the triangle
+        obj, action, _ = trial(config, id)
+        normals.append(action.direction)
+    np.testing.assert_allclose(normals[0::2], normals[1::2])
+    assert len(np.unique(np.round(normals, 9), axis=0)) == 3
+    seeds = {trial(config, id)[2] for id in range(num_trials(config))}
+    assert len(seeds) == num_trials(config)
+    collecting._object_and_actions.cache_clear()
+    again, action_again, _ = trial(config, 5)
+    assert again.to_dict() == obj.to_dict()
+    np.testing.assert_array_equal(action_again.contact, action.contact)
+    other, _, _ = trial(replace(config, seed=6), 5)
+    assert other.to_dict() != obj.to_dict()
+
+
+def test_more_objects_begin_with_the_same_trials():
+    small, large = CollectConfig(objects=8), CollectConfig(objects=160)
+    for id in (0, 50, 103):
+        assert trial(small, id)[0].to_dict() == trial(large, id)[0].to_dict()
+        assert trial(small, id)[2] == trial(large, id)[2]
+
+
+def test_simulate_trial_hands_everything_over(monkeypatch):
+    calls = []
+
+    def fake_simulate(obj, action, config, *, seed, id):
+        calls.append((config, seed, id))
+        return factories.fake_lever_up(obj, action, id=id, seed=seed)
+
+    monkeypatch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake_simulate)
+    interaction = simulate_trial(SMALL, 17)
+    assert calls == [(SMALL.simulation, trial(SMALL, 17)[2], 17)]
+    assert interaction.id == 17
+
+
+@pytest.mark.parametrize("wrong", [{"objects": 0}, {"contacts_per_edge": 0}, {"seed": -1}])
+def test_impossible_configurations_are_refused(wrong):
+    with pytest.raises(SimulationError, match=str(next(iter(wrong.values())))):
+        CollectConfig(**wrong)
+
+
+def test_a_collected_data_set_is_whole(reference):
+    assert examine(reference).findings == ()
+    dataset = Dataset.open(reference, failed=True)
+    assert dataset.table["id"].to_pylist() == list(range(208))
+    assert dataset.outcomes() == {"levered": 203, "failed": 5}
+    assert dataset.table["object_id"].to_pylist()[:7] == [0] * 6 + [1]
+    assert json.loads(json.dumps(dataset.manifest["configuration"]))["objects"] == 16
+    alone = fake_trial(SMALL, 123)
+    np.testing.assert_array_equal(dataset[123].effect.pose_trajectory, alone.effect.pose_trajectory)
+    assert dataset[123].provenance.seed == alone.provenance.seed
+
+
+def test_shards_are_the_same_bytes_with_two_workers(reference, tmp_path):
+    counts = collect(SMALL, tmp_path / "two", workers=2, console=quiet(), simulate=torch_free_trial)
+    assert counts == {"levered": 203, "failed": 5}
+    assert shards_of(tmp_path / "two") == shards_of(reference)
+    assert len(shards_of(reference)) == 3
+
+
+def test_collecting_again_does_nothing(reference):
+    before = shards_of(reference)
+    times = [file.stat().st_mtime_ns for file in (reference / storage.SHARD_FOLDER).iterdir()]
+    counts = collect(SMALL, reference, workers=1, console=quiet(), simulate=reluctant_trial)
+    assert counts == {"levered": 203, "failed": 5}
+    assert shards_of(reference) == before
+    assert times == [file.stat().st_mtime_ns for file in (reference / storage.SHARD_FOLDER).iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"seed": 1}, "begun with seed = 0, asked for is seed = 1"),
+        ({"objects": 8}, "begun with objects = 16, asked for is objects = 8"),
+    ],
+)
+def test_another_configuration_in_the_same_folder_is_refused(reference, changed, message):
+    before = shards_of(reference)
+    with pytest.raises(DatasetError, match=message):
+        collect(replace(SMALL, **changed), reference, workers=1, console=quiet(), simulate=fake_trial)
+    assert shards_of(reference) == before
+
+
+def test_nested_settings_are_compared_too(reference, tmp_path):
+    manifest = storage.read_manifest(reference)
+    manifest["configuration"]["simulation"]["engine"] = "newton"
+    (tmp_path / storage.SHARD_FOLDER).mkdir()
+    storage.write_manifest(tmp_path, manifest)
+    with pytest.raises(DatasetError, match=r"simulation\.engine = newton, asked for is simulation"):
+        collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
+
+
+def test_foreign_folders_are_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(DatasetError, match=r"holds thesis\.tex and is no data set"):
+        collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
+    with pytest.raises(DatasetError, match=r"thesis\.tex is a file"):
+        collect(SMALL, tmp_path / "thesis.tex", workers=1, console=quiet(), simulate=fake_trial)
+    with pytest.raises(SimulationError, match="workers is 0"):
+        collect(SMALL, tmp_path / "new", workers=0, console=quiet(), simulate=fake_trial)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_trial_that_cannot_be_simulated_stops_the_run_and_is_named(tmp_path, workers):
+    with pytest.raises(SimulationError, match="trial 150 cannot be simulated: no engine by that name"):
+        collect(SMALL, tmp_path, workers=workers, console=quiet(), simulate=reluctant_trial)
+    assert examine(tmp_path).num_interactions % 100 == 0
+
+
+def test_an_interrupted_run_keeps_what_is_done_and_goes_on(reference, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=interrupted_trial)
+    assert list(shards_of(tmp_path)) == ["shard-00000.parquet"]
+    collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
+    assert shards_of(tmp_path) == shards_of(reference)
+
+
+def test_damage_is_made_good(reference, tmp_path):
+    collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
+    first, second, third = (tmp_path / storage.shard_name(k) for k in range(3))
+    first.unlink()
+    second.write_bytes(second.read_bytes()[:-1])
+    manifest = storage.read_manifest(tmp_path)
+    del manifest["shards"][storage.shard_name(2)]  # killed between the shard and the manifest
+    storage.write_manifest(tmp_path, manifest)
+    (tmp_path / storage.SHARD_FOLDER / "shard-00001.parquet.1.tmp").write_bytes(b"half")
+    begun = time.time_ns()
+    collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
+    assert shards_of(tmp_path) == shards_of(reference)
+    assert examine(tmp_path).findings == ()
+    assert third.stat().st_mtime_ns < begun, "a whole shard is not made again"
+
+
+def test_kill_9_loses_only_the_shards_in_work(reference, tmp_path):
+    folder = tmp_path / "data"
+    code = (
+        "from foretrace.simulation.collect import collect; import test_collect;"
+        f"collect(test_collect.SMALL, {str(folder)!r}, workers=2, simulate=test_collect.slow_trial)"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, start_new_session=True
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not (folder / storage.shard_name(0)).exists():
+            assert process.poll() is None, "finished or failed before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        done = {name: sha for name, sha in shards_of(folder).items() if not name.endswith(".tmp")}
+        assert 1 <= len(done) < 3
+        collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)  # its workers, should they still be there
+    assert done.items() <= shards_of(folder).items()
+    assert shards_of(folder) == shards_of(reference)
+    assert examine(folder).findings == ()
+
+
+def test_progress_is_reported_in_plain_lines_without_a_terminal(tmp_path, monkeypatch):
+    monkeypatch.setattr(collecting, "PLAIN_REPORT_PERIOD", 0.0)
+    console = Console(file=(tmp_path / "log").open("w+"), force_terminal=False, width=40)
+    collect(CollectConfig(objects=8), tmp_path / "data", workers=1, console=console, simulate=fake_trial)
+    console.file.seek(0)
+    lines = console.file.read().splitlines()
+    assert len(lines) == 11
+    assert lines[0].startswith("10 of 104 interactions, ")
+    assert "s left: 10 levered" in lines[0]
+    assert "102 levered, 2 failed" in lines[-1]
