@@ -1,0 +1,78 @@
+"""Convolutional features, trained together with the predictor (paper, section 3.3)."""
+
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from foretrace.features.base import FeatureExtractor
+from foretrace.interactions.dataset import InteractionBatch
+
+CHANNELS = (32, 64, 128, 256)
+"""Channels of the four convolutions (paper, section 3.3)."""
+HEIGHT_SCALE = 0.1
+"""Heights are divided by this to be of unit scale [m]."""
+
+
+class ConvolutionStack(nn.Module):
+    """3x3 convolutions, each followed by ReLU and 2x2 max-pooling, channels doubling from 32 to 256."""
+
+    def __init__(self, in_channels: int = 1):
+        super().__init__()
+        sizes = (in_channels, *CHANNELS)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(before, after, kernel_size=3, padding=1) for before, after in pairwise(sizes)
+        )
+        # With channels last a CPU needs 0.6 of the time.
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def forward(self, images: Float[Tensor, "batch channels rows columns"]) -> Float[Tensor, "batch 256 r c"]:
+        """Feature maps of a sixteenth of the images' size."""
+        x = images.contiguous(memory_format=torch.channels_last)
+        for convolution in self.convolutions:
+            # Pooling and rectifying commute; pooling first leaves a quarter to rectify.
+            x = F.relu(F.max_pool2d(convolution(x), 2))
+        return x
+
+
+class ImageCnn(FeatureExtractor):
+    """``im-cnn``: a convolutional network on the top-down view.
+
+    The paper leaves the width after the convolutions open: here the 8x8x256 map is flattened into one dense
+    layer of ``width`` rectified units with dropout.
+
+    Args:
+        channel: What it looks at: the object's ``mask`` or its ``height`` map.
+        width: Number of features.
+        dropout: Fraction of the features dropped at each training step.
+    """
+
+    label = "im-cnn"
+
+    def __init__(self, channel: Literal["mask", "height"] = "mask", width: int = 128, dropout: float = 0.2):
+        super().__init__(channel=channel, width=width, dropout=dropout)
+        self.channel = channel
+        self.stack = ConvolutionStack()
+        self.dense = nn.Linear(8 * 8 * CHANNELS[-1], width)
+        self.dropout = nn.Dropout(dropout)
+
+    @property
+    def num_features(self) -> int:
+        """Units of the dense layer."""
+        return self.dense.out_features
+
+    def inputs(self, batch: InteractionBatch) -> Shaped[Tensor, "batch 1 128 128"]:
+        """The masks as bytes (0 or 1), or the height maps in units of 10 cm."""
+        if self.channel == "mask":
+            return torch.from_numpy(batch.mask).to(torch.uint8)[:, None]
+        return torch.from_numpy(batch.height).float()[:, None] / HEIGHT_SCALE
+
+    def forward(self, inputs: Shaped[Tensor, "batch 1 128 128"]) -> Float[Tensor, "batch features"]:
+        """Convolutions in ``precision`` while training, the dense layer always in float32."""
+        reduced = self.training and self.precision == "bfloat16"
+        with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=reduced):
+            maps = self.stack(inputs.float())
+        return self.dropout(F.relu(self.dense(maps.float().flatten(1))))

@@ -1,0 +1,21 @@
+"""Predictors of an action's effect: networks, their training, their checkpoints."""
+
+from foretrace.predictor.base import EffectPredictor, ImaginedBatch, ImaginedEffect
+from foretrace.predictor.checkpoint import PREDICTORS, load_predictor, save_checkpoint
+from foretrace.predictor.lstm import LstmConfig, LstmPredictor
+from foretrace.predictor.run_folder import part_of
+from foretrace.predictor.training import TrainConfig, train_predictor
+
+__all__ = [
+    "PREDICTORS",
+    "EffectPredictor",
+    "ImaginedBatch",
+    "ImaginedEffect",
+    "LstmConfig",
+    "LstmPredictor",
+    "TrainConfig",
+    "load_predictor",
+    "part_of",
+    "save_checkpoint",
+    "train_predictor",
+]

@@ -1,0 +1,146 @@
+"""Predictors on disk: ``config.json`` and ``model.safetensors``. Nothing is ever unpickled."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from foretrace.errors import CheckpointError, TrainingError
+from foretrace.features import make_features
+from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.files import write_json, write_tensors
+from foretrace.predictor.lstm import LstmConfig, LstmPredictor
+
+FORMAT = "foretrace-predictor"
+FORMAT_VERSION = 1
+CONFIG = "config.json"
+MODEL = "model.safetensors"
+PREDICTORS: dict[str, tuple[type[LstmPredictor], type[LstmConfig]]] = {
+    LstmPredictor.label: (LstmPredictor, LstmConfig)
+}
+"""Every kind of predictor by its label, with the class of its settings."""
+
+
+def describe(predictor: EffectPredictor) -> dict[str, Any]:
+    """What ``config.json`` must say for the predictor to be made again."""
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "predictor": predictor.label,
+        "settings": asdict(predictor.config),
+        "features": {"label": predictor.features.label, "options": predictor.features.options},
+        "num_samples": predictor.num_samples,
+    }
+
+
+def save_checkpoint(
+    directory: str | Path, predictor: EffectPredictor, training: Mapping[str, Any] | None = None
+) -> None:
+    """Write a predictor into a folder.
+
+    Args:
+        directory: The folder; made if it is not there.
+        predictor: The predictor.
+        training: How it was trained, kept in ``config.json`` for the record.
+    """
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    write_tensors(directory / MODEL, predictor.state_dict())
+    write_json(directory / CONFIG, describe(predictor) | {"training": dict(training or {})})
+
+
+def load_predictor(path: str | Path) -> EffectPredictor:
+    """Read a predictor from a folder that `save_checkpoint` or `train_predictor` wrote.
+
+    Raises:
+        CheckpointError: A file is missing or damaged, of another version, or the tensors do not fit.
+    """
+    path = Path(path)
+    config = read_config(path)
+    model = path / MODEL
+    if not model.is_file():
+        raise CheckpointError(
+            f"{model} is missing: the training has not finished an epoch yet, or the copy is partial"
+        )
+    try:
+        tensors = load_file(model)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{model} cannot be read ({error}): copy it again or train anew") from error
+    # Its first weights are drawn only to be replaced: the caller's random numbers must not notice.
+    with torch.random.fork_rng(devices=[]):
+        predictor = _make(config, path / CONFIG)
+    load_tensors(predictor, tensors, model)
+    return predictor.eval()
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The contents of a checkpoint's ``config.json``.
+
+    Raises:
+        CheckpointError: It is missing, damaged or of another version.
+    """
+    file = path / CONFIG
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing: {path} is not the folder of a trained predictor")
+    try:
+        config = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CheckpointError(f"{file} is not JSON ({error}): copy it again or train anew") from error
+    if not isinstance(config, dict) or config.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{file} does not describe a {FORMAT}: {path} is not the folder of a trained predictor"
+        )
+    if config.get("version") != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{file} has format version {config.get('version')!r}, this foretrace reads {FORMAT_VERSION}: "
+            "use the foretrace that wrote it, or train anew"
+        )
+    return config
+
+
+def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -> None:
+    """Fill a module's parameters and buffers, all of them and no others.
+
+    Raises:
+        CheckpointError: A tensor is missing, unexpected, or of another shape or type.
+    """
+    expected = module.state_dict()
+    advice = f"it does not belong to its {CONFIG}"
+    if missing := sorted(expected.keys() - tensors.keys()):
+        raise CheckpointError(f"{file} lacks the tensors {', '.join(missing)}: {advice}")
+    if extra := sorted(tensors.keys() - expected.keys()):
+        raise CheckpointError(f"{file} has unexpected tensors {', '.join(extra)}: {advice}")
+    for name, tensor in tensors.items():
+        wanted = expected[name]
+        if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
+            raise CheckpointError(
+                f"{file}: {name} is {tuple(tensor.shape)} {tensor.dtype}, its {CONFIG} asks for "
+                f"{tuple(wanted.shape)} {wanted.dtype}"
+            )
+    module.load_state_dict(dict(tensors))
+
+
+def _make(config: Mapping[str, Any], file: Path) -> EffectPredictor:
+    """The predictor that a configuration describes, untrained."""
+    if config.get("predictor") not in PREDICTORS:
+        raise CheckpointError(
+            f"{file}: unknown predictor {config.get('predictor')!r}; available: {', '.join(PREDICTORS)}"
+        )
+    kind, settings_kind = PREDICTORS[config["predictor"]]
+    known = {f.name for f in fields(settings_kind)}
+    try:
+        settings, features, num_samples = config["settings"], config["features"], config["num_samples"]
+        if odd := sorted(known ^ settings.keys()):
+            raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
+        extractor = make_features(features["label"], **features["options"])
+        return kind(extractor, num_samples, settings_kind(**settings))
+    except TrainingError as error:
+        raise CheckpointError(f"{file}: {error}") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{file} is incomplete ({error!r}): copy it again or train anew") from error

@@ -1,0 +1,210 @@
+"""The paper's predictor: a Long Short-Term Memory network over states and object features (section 3.1)."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from foretrace.features import FeatureExtractor
+from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.states import StateKind, state_size
+
+
+@dataclass(frozen=True)
+class LstmConfig:
+    """Settings of the paper's predictor."""
+
+    state: StateKind = "position"
+    """What is predicted: the centre of mass, or the whole pose."""
+    steps_ahead: int = 1
+    """States predicted per iteration (n in the paper)."""
+    hidden: int = 256
+    """LSTM units."""
+    window: int = 15
+    """States that one training sequence shows."""
+    stride: int = 15
+    """Samples between the starts of neighbouring training sequences."""
+    memory: Literal["carried", "window"] = "carried"
+    """Whether a roll-out carries the LSTM's memory from the first state on, or reads the last ``window``
+    states anew in every iteration."""
+
+
+class ProjectedLstm(nn.Module):
+    """An LSTM layer whose input is a changing state beside features that stay the same.
+
+    Mathematically an LSTM over the concatenation of both; since the features are constant in time, their
+    share in the gates is computed once per trajectory instead of once per step and window.
+
+    Args:
+        num_states: Numbers in one state.
+        num_features: Numbers in a feature vector.
+        hidden: Units.
+    """
+
+    def __init__(self, num_states: int, num_features: int, hidden: int):
+        super().__init__()
+        self.hidden = hidden
+        # Gates in the order input, forget, cell, output.
+        weight_input = torch.empty(4 * hidden, num_states + num_features)
+        nn.init.xavier_uniform_(weight_input)
+        self.weight_state = nn.Parameter(weight_input[:, :num_states].clone())
+        self.weight_features = nn.Parameter(weight_input[:, num_states:].clone())
+        self.weight_hidden = nn.Parameter(nn.init.orthogonal_(torch.empty(4 * hidden, hidden)))
+        bias = torch.zeros(4 * hidden)
+        bias[hidden : 2 * hidden] = 1.0  # remember at first
+        self.bias = nn.Parameter(bias)
+
+    def project(self, features: Float[Tensor, "batch features"]) -> Float[Tensor, "batch gates"]:
+        """The features' share in the gates, biases included."""
+        return torch.addmm(self.bias, features, self.weight_features.t())
+
+    def step(
+        self,
+        state: Float[Tensor, "batch state"],
+        projected: Float[Tensor, "batch gates"],
+        memory: tuple[Tensor, Tensor] | None,
+    ) -> tuple[Tensor, Tensor]:
+        """The next output and cell, each (batch, hidden), from the last ones (None at the start)."""
+        gates = torch.addmm(projected, state, self.weight_state.t())
+        if memory is not None:
+            gates = torch.addmm(gates, memory[0], self.weight_hidden.t())
+        enter, forget, new, leave = gates.chunk(4, dim=1)
+        cell = enter.sigmoid() * new.tanh()
+        if memory is not None:
+            cell = cell + forget.sigmoid() * memory[1]
+        return leave.sigmoid() * cell.tanh(), cell
+
+    def forward(
+        self, states: Float[Tensor, "batch time state"], projected: Float[Tensor, "batch gates"]
+    ) -> Float[Tensor, "batch time hidden"]:
+        """Outputs at every step of sequences that start without memory; fast to train."""
+        return _LstmSequence.apply(states, projected, self.weight_state, self.weight_hidden)
+
+
+class _LstmSequence(torch.autograd.Function):
+    """The whole sequence as one node of the graph.
+
+    Up to twice as fast on a CPU as letting autograd record each step: activations are overwritten in place,
+    and the gradient of the recurrent weights is one large product over all steps.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, states: Tensor, projected: Tensor, weight_state: Tensor, weight_hidden: Tensor
+    ) -> Tensor:
+        batch, time, _ = states.shape
+        hidden = weight_hidden.shape[1]
+        x = states.transpose(0, 1)  # (time, batch, state)
+        outputs = x.new_zeros(time + 1, batch, hidden)
+        cells = x.new_zeros(time + 1, batch, hidden)
+        gates = x.new_empty(time, batch, 4 * hidden)
+        squashed = x.new_empty(time, batch, hidden)
+        for t in range(time):
+            torch.addmm(projected, x[t], weight_state.t(), out=gates[t])
+            if t > 0:
+                gates[t].addmm_(outputs[t], weight_hidden.t())
+            enter, forget, new, leave = gates[t].chunk(4, dim=1)
+            gates[t, :, : 2 * hidden].sigmoid_()
+            new.tanh_()
+            leave.sigmoid_()
+            torch.mul(enter, new, out=cells[t + 1]).addcmul_(forget, cells[t])
+            torch.tanh(cells[t + 1], out=squashed[t])
+            torch.mul(leave, squashed[t], out=outputs[t + 1])
+        ctx.save_for_backward(x, weight_state, weight_hidden, outputs, cells, gates, squashed)
+        return outputs[1:].transpose(0, 1)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        x, weight_state, weight_hidden, outputs, cells, gates, squashed = ctx.saved_tensors
+        time, batch, width = gates.shape
+        sigmoid_back, tanh_back = torch.ops.aten.sigmoid_backward, torch.ops.aten.tanh_backward
+        grad = grad.transpose(0, 1)
+        grad_gates = torch.empty_like(gates)
+        grad_output = torch.zeros_like(outputs[0])
+        grad_cell = torch.zeros_like(outputs[0])
+        for t in reversed(range(time)):
+            enter, forget, new, leave = gates[t].chunk(4, dim=1)
+            to_enter, to_forget, to_new, to_leave = grad_gates[t].chunk(4, dim=1)
+            grad_output = grad_output + grad[t]
+            grad_cell = grad_cell + tanh_back(grad_output * leave, squashed[t])
+            to_enter.copy_(sigmoid_back(grad_cell * new, enter))
+            to_forget.copy_(sigmoid_back(grad_cell * cells[t], forget))
+            to_new.copy_(tanh_back(grad_cell * enter, new))
+            to_leave.copy_(sigmoid_back(grad_output * squashed[t], leave))
+            grad_cell = grad_cell * forget
+            if t > 0:
+                grad_output = grad_gates[t] @ weight_hidden
+        flat = grad_gates.view(time * batch, width)
+        grad_hidden = flat[batch:].t() @ outputs[1:time].reshape((time - 1) * batch, -1)
+        grad_state = flat.t() @ x.reshape(time * batch, -1)
+        grad_x = (grad_gates @ weight_state).transpose(0, 1) if ctx.needs_input_grad[0] else None
+        return grad_x, grad_gates.sum(0), grad_state, grad_hidden
+
+
+class LstmPredictor(EffectPredictor):
+    """Section 3.1: state and features into 256 LSTM units, a dense layer from there to the next n states.
+
+    Args:
+        features: What it knows about the object.
+        num_samples: Samples in an imagined trajectory.
+        config: Settings.
+    """
+
+    label = "lstm"
+
+    def __init__(self, features: FeatureExtractor, num_samples: int, config: LstmConfig | None = None):
+        config = config or LstmConfig()
+        super().__init__(features, config.state, num_samples)
+        self._config = config
+        size = state_size(config.state)
+        self.lstm = ProjectedLstm(size, features.num_features, config.hidden)
+        self.output = nn.Linear(config.hidden, config.steps_ahead * size)
+        nn.init.xavier_uniform_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+
+    @property
+    def config(self) -> LstmConfig:
+        """Settings."""
+        return self._config
+
+    def training_loss(
+        self,
+        features: Float[Tensor, "batch features"],
+        states: Float[Tensor, "batch time state"],
+        lengths: Int[Tensor, " batch"],
+    ) -> Float[Tensor, ""]:
+        """Mean squared error of every step's n predicted states, over all windows of the trajectories.
+
+        The LSTM sees recorded states; all windows of a trajectory share the projection of its features.
+        """
+        batch, time, size = states.shape
+        ahead, window = self._config.steps_ahead, min(self._config.window, time - 1)
+        starts = torch.arange(0, time - 1, self._config.stride, device=states.device)
+        steps = starts[:, None] + torch.arange(window, device=states.device)  # (windows, window)
+        predicted = steps[..., None] + torch.arange(1, ahead + 1, device=states.device)
+        padded = F.pad(states, (0, 0, 0, window + ahead))
+        projected = self.lstm.project(features).repeat_interleave(len(starts), dim=0)
+        outputs = self.output(self.lstm(padded[:, steps].flatten(0, 1), projected))
+        errors = outputs.view(batch, *predicted.shape, size) - padded[:, predicted]
+        valid = predicted < lengths[:, None, None, None]
+        return (errors.square().mean(-1) * valid).sum() / valid.sum()
+
+    def roll_out(
+        self, features: Float[Tensor, "batch features"], first: Float[Tensor, "batch state"]
+    ) -> Float[Tensor, "batch time state"]:
+        """Feed predictions back, n states per iteration, until the trajectory is whole."""
+        projected = self.lstm.project(features)
+        states = [first]
+        memory, num_read = None, 0
+        while len(states) < self.num_samples:
+            if self._config.memory == "window":
+                memory, num_read = None, max(0, len(states) - self._config.window)
+            for state in states[num_read:]:
+                memory = self.lstm.step(state, projected, memory)
+            num_read = len(states)
+            assert memory is not None
+            states += self.output(memory[0]).view(len(first), self._config.steps_ahead, -1).unbind(1)
+        return torch.stack(states[: self.num_samples], dim=1)

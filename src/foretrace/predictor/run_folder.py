@@ -1,0 +1,237 @@
+"""The folder of one training: configuration, surroundings, progress, the best model so far."""
+
+import csv
+import hashlib
+import importlib.metadata
+import io
+import json
+import platform
+import subprocess
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from foretrace.errors import TrainingError
+from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.splits import Split
+from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.checkpoint import CONFIG, MODEL, describe, load_tensors, read_config
+from foretrace.predictor.files import write_json, write_tensors, write_text
+
+ENVIRONMENT = "environment.json"
+METRICS = "metrics.csv"
+SPLIT = "split.json"
+RESUME = "resume.safetensors"
+TENSORBOARD = "tensorboard"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a training has come."""
+
+    history: list[dict[str, float]] = field(default_factory=list)
+    """One row of metrics per finished epoch."""
+    best_epoch: int = 0
+    """The epoch whose model is kept, counted from 1; 0 before there is one."""
+
+    @property
+    def epoch(self) -> int:
+        """Epochs finished."""
+        return len(self.history)
+
+    @property
+    def best_loss(self) -> float:
+        """The smallest validation loss so far."""
+        return self.history[self.best_epoch - 1]["validation_loss"] if self.best_epoch else float("inf")
+
+    def with_epoch(self, row: dict[str, float]) -> "Progress":
+        """The progress after another epoch, which is the best if its validation loss is the smallest."""
+        better = row["validation_loss"] < self.best_loss
+        return replace(
+            self, history=[*self.history, row], best_epoch=self.epoch + 1 if better else self.best_epoch
+        )
+
+
+class RunFolder:
+    """Reads and writes the folder of one training.
+
+    ``resume.safetensors`` is there from before the first epoch until the last: a folder with a model and
+    without it is a finished training.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the training has run to its end."""
+        return (self.path / MODEL).is_file() and not (self.path / RESUME).is_file()
+
+    def start(self, predictor: EffectPredictor, training: Mapping[str, Any], resume: bool) -> None:
+        """Claim the folder for a training.
+
+        Args:
+            predictor: The predictor to be trained.
+            training: All that decides the outcome of the training, JSON-able.
+            resume: Whether to go on with a training that the folder holds; otherwise that is discarded.
+
+        Raises:
+            TrainingError: The folder holds a training of another configuration, or something else.
+        """
+        config = describe(predictor) | {"training": json.loads(json.dumps(training))}
+        if resume and (self.path / CONFIG).is_file():
+            self._check(config)
+            return
+        if not (self.path / CONFIG).is_file() and self.path.is_dir() and any(self.path.iterdir()):
+            raise TrainingError(f"{self.path} is not empty and holds no training: choose another folder")
+        self.path.mkdir(parents=True, exist_ok=True)
+        for name in (RESUME, MODEL, METRICS):
+            (self.path / name).unlink(missing_ok=True)
+        for events in self.path.glob(f"{TENSORBOARD}/events.*"):
+            events.unlink()
+        write_json(self.path / CONFIG, config)
+
+    def _check(self, config: Mapping[str, Any]) -> None:
+        found, wanted = _flat(read_config(self.path)), _flat(config)
+        for name in sorted(found.keys() | wanted.keys()):
+            if found.get(name) != wanted.get(name):
+                raise TrainingError(
+                    f"{self.path} holds a training with {name} = {found.get(name)!r}, not "
+                    f"{wanted.get(name)!r}: choose another folder, the same configuration, or do not resume"
+                )
+
+    def write_environment(self, facts: Mapping[str, Any]) -> None:
+        """Note what the training runs on."""
+        write_json(self.path / ENVIRONMENT, {**facts, "commit": _git_commit(), "versions": _versions()})
+
+    def write_split(self, batch: InteractionBatch, split: Split) -> None:
+        """Note the ids of the interactions in each part."""
+        write_json(
+            self.path / SPLIT, {part: batch.ids[rows].tolist() for part, rows in asdict(split).items()}
+        )
+
+    def save(self, progress: Progress, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
+        """Note the end of an epoch; the model itself too if the epoch is the best so far."""
+        if progress.epoch and progress.best_epoch == progress.epoch:
+            write_tensors(self.path / MODEL, predictor.state_dict())
+        if progress.history:
+            table = io.StringIO()
+            writer = csv.DictWriter(table, progress.history[0].keys(), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(progress.history)
+            write_text(self.path / METRICS, table.getvalue())
+        tensors = {f"model.{name}": tensor for name, tensor in predictor.state_dict().items()}
+        for index, values in optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{index}.{name}": value for name, value in values.items()}
+        write_tensors(self.path / RESUME, tensors, {"progress": json.dumps(asdict(progress))})
+
+    def restore(self, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> Progress | None:
+        """Go back to the end of the last epoch noted; None where none was.
+
+        Raises:
+            TrainingError: The file is damaged.
+            CheckpointError: Its tensors do not fit.
+        """
+        file = self.path / RESUME
+        if not file.is_file():
+            return None
+        try:
+            with safe_open(file, framework="pt") as opened:
+                tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+                progress = Progress(**json.loads(opened.metadata()["progress"]))
+        except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+            raise TrainingError(f"{file} cannot be read ({error}): train anew without resuming") from error
+        load_tensors(predictor, _below("model.", tensors), file)
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in _below("optimizer.", tensors).items():
+            index, key = name.split(".")
+            state.setdefault(int(index), {})[key] = tensor
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": state})
+        return progress
+
+    def finish(self) -> None:
+        """Declare the training finished."""
+        (self.path / RESUME).unlink(missing_ok=True)
+
+
+def fingerprint(batch: InteractionBatch) -> str:
+    """A short hash of everything in a batch that a training can read."""
+    digest = hashlib.sha256()
+    for name in ("ids", "mask", "height", "corners", "times", "com", "pose", "length", "slip_index"):
+        digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
+    digest.update(np.ascontiguousarray(batch.support_points).tobytes())
+    digest.update("\n".join(batch.outcome.tolist()).encode())
+    return digest.hexdigest()[:16]
+
+
+def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test") -> InteractionBatch:
+    """The interactions that were one part of a training's split.
+
+    Args:
+        run: Folder of the training.
+        data: The data set that it was trained on.
+        part: ``train``, ``validation`` or ``test``.
+
+    Raises:
+        TrainingError: The folder tells of no such part, or the data lacks some of its interactions.
+    """
+    file = Path(run) / SPLIT
+    if not file.is_file():
+        raise TrainingError(f"{file} is missing: {run} is not the folder of a training")
+    parts = json.loads(file.read_text(encoding="utf-8"))
+    if part not in parts:
+        raise TrainingError(f"{file} has no part {part!r}; it has: {', '.join(parts)}")
+    batch = data if isinstance(data, InteractionBatch) else data.batch()
+    rows = np.flatnonzero(np.isin(batch.ids, parts[part]))
+    if len(rows) != len(parts[part]):
+        raise TrainingError(
+            f"the data has {len(rows)} of the {len(parts[part])} interactions in the {part} part of {run}: "
+            "give the data set that it was trained on"
+        )
+    return batch[rows]
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def _versions() -> dict[str, str]:
+    names = ("foretrace", "numpy", "safetensors", "torch")
+    versions = {"python": platform.python_version()}
+    for name in names:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+def _git_commit() -> str | None:
+    """Commit of the checkout that this code lies in, if it lies in one."""
+    try:
+        found = subprocess.run(
+            ["git", "rev-parse", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    except OSError:
+        return None
+    return found.stdout.strip() if found.returncode == 0 else None
