@@ -1,20 +1,19 @@
 """The lever-up action: where the blade goes under the object, and which way it pushes."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import ActionError
-from foretrace.geometry import inward_normals
+from foretrace.geometry import Numbers, inward_normals
 from foretrace.objects import ObjectModel
 
 CORNER_MARGIN = 0.001
 """A contact point snapped to the outline keeps this distance from the corners [m]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class LeverUp:
     """A lever-up, placed on its object (paper, section 4).
 
@@ -27,23 +26,19 @@ class LeverUp:
     direction: Float[np.ndarray, "2"]
     """Unit vector along which the blade is pushed, in the object frame; usually the inward edge normal."""
 
-    def __post_init__(self) -> None:
-        contact, direction = np.array(self.contact, dtype=float), np.array(self.direction, dtype=float)
-        for name, vector in (("contact", contact), ("direction", direction)):
-            if vector.shape != (2,) or not np.isfinite(vector).all():
-                raise ActionError(
-                    f"{name} {vector.tolist()}: expected two finite numbers in the object frame"
-                )
+    def __init__(self, contact: Numbers, direction: Numbers) -> None:
+        contact = plane_vector("contact", contact)
+        direction = plane_vector("direction", direction)
         length = np.linalg.norm(direction)
         if length < 1e-9:
             raise ActionError(f"direction {direction.tolist()} has no length: give a vector into the object")
-        direction /= length
-        for name, vector in (("contact", contact), ("direction", direction)):
-            vector.setflags(write=False)
-            object.__setattr__(self, name, vector)
+        object.__setattr__(self, "contact", contact)
+        object.__setattr__(self, "direction", direction / length)
+        self.contact.setflags(write=False)
+        self.direction.setflags(write=False)
 
     @classmethod
-    def at_edge(cls, obj: ObjectModel, edge: int, fraction: float = 0.5) -> Self:
+    def at_edge(cls, obj: ObjectModel, edge: int, fraction: float = 0.5) -> "LeverUp":
         """The lever-up at a fraction of an edge, pushing along its inward normal.
 
         Args:
@@ -63,7 +58,7 @@ class LeverUp:
         return cls(start + fraction * (stop - start), inward_normals(obj.corners)[edge])
 
     @classmethod
-    def nearest(cls, obj: ObjectModel, point: Float[np.ndarray, "2"] | tuple[float, float]) -> Self:
+    def nearest(cls, obj: ObjectModel, point: Numbers) -> "LeverUp":
         """The lever-up at the point of the outline nearest to a given one, pushing along that edge's normal.
 
         Near a corner the contact keeps a millimetre from it (or half of a shorter edge), on the edge that
@@ -72,11 +67,7 @@ class LeverUp:
         Raises:
             ActionError: if the point is not finite.
         """
-        point = np.array(point, dtype=float)
-        if point.shape != (2,) or not np.isfinite(point).all():
-            raise ActionError(
-                f"contact point {point.tolist()}: expected two finite numbers in the object frame"
-            )
+        point = plane_vector("contact point", point)
         starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
         lengths = np.linalg.norm(stops - starts, axis=1)
         along = ((point - starts) * (stops - starts)).sum(axis=1) / lengths**2
@@ -96,6 +87,18 @@ class LeverUp:
         transform[:2, :2] = [self.direction, [-self.direction[1], self.direction[0]]]
         transform[:2, 3] = -transform[:2, :2] @ self.contact
         return transform
+
+
+def plane_vector(name: str, values: Numbers) -> Float[np.ndarray, "2"]:
+    """Two finite numbers as an array of its own.
+
+    Raises:
+        ActionError: naming the vector, if the values are anything else.
+    """
+    vector = np.array(values, dtype=float)
+    if vector.shape != (2,) or not np.isfinite(vector).all():
+        raise ActionError(f"{name} {vector.tolist()}: expected two finite numbers, object frame")
+    return vector
 
 
 def sample_contacts(obj: ObjectModel, rng: np.random.Generator, per_edge: int = 2) -> list[LeverUp]:

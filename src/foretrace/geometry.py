@@ -4,8 +4,14 @@ A pose is a row of seven numbers ``x y z qw qx qy qz``; a transform is a 4 x 4 m
 corners without a repeated closing corner. Lengths are in metres and angles in radians unless stated.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float
+
+Numbers = np.ndarray | Sequence[Any]
+"""What users may give for an array: an array, or lists or tuples of numbers, nested."""
 
 
 def cross(a: Float[np.ndarray, "*batch 2"], b: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch"]:

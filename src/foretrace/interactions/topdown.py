@@ -5,16 +5,14 @@ point lies between two rows and two columns, so that the grid is its own mirror 
 """
 
 from dataclasses import dataclass
-from typing import Self
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
-from numpy.typing import ArrayLike
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ActionError, ShapeError, ViewError
-from foretrace.geometry import mask_outline
+from foretrace.geometry import Numbers, mask_outline
 from foretrace.objects import ObjectModel, read_silhouette, silhouette_origin
 
 VIEW_SIZE = 128
@@ -23,6 +21,8 @@ METRES_PER_PIXEL = 0.0032
 """Side of a pixel [m]."""
 ROWS_AHEAD = 96
 """Rows of pixels ahead of the contact point; the rest lies behind it."""
+CONTACT_PIXEL = np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5])
+"""Row and column of the contact point, with pixel centres at whole numbers."""
 MINIMAL_HEIGHT = 0.004
 """Points of a cloud below this height belong to the table [m]."""
 
@@ -38,8 +38,16 @@ class TopDownView:
     metres_per_pixel: float = METRES_PER_PIXEL
     """Side of a pixel [m]."""
 
+    def __post_init__(self) -> None:
+        for name, dtype in (("mask", bool), ("height", np.float32)):
+            values = np.array(getattr(self, name), dtype=dtype)
+            if values.shape != (VIEW_SIZE, VIEW_SIZE):
+                raise ViewError(f"{name} of shape {values.shape}: expected ({VIEW_SIZE}, {VIEW_SIZE}) pixels")
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+
     @classmethod
-    def of(cls, obj: ObjectModel, action: LeverUp) -> Self:
+    def of(cls, obj: ObjectModel, action: LeverUp) -> "TopDownView":
         """The exact view of a known object: a pixel shows what lies at its centre.
 
         Raises:
@@ -61,14 +69,14 @@ class TopDownView:
         cls,
         mask: Shaped[np.ndarray, "rows columns"],
         metres_per_pixel: float,
-        contact: ArrayLike,
-        direction: ArrayLike,
+        contact: Numbers,
+        direction: Numbers,
         height: float = 0.02,
-    ) -> Self:
+    ) -> "TopDownView":
         """The view of an object known by its silhouette alone.
 
         Args:
-            mask: the object not 0 (or True), the background 0. Holes are filled.
+            mask: the object white (or True) on black. Holes are filled.
             metres_per_pixel: scale of the image [m].
             contact: contact point in the frame of ``Prism.from_mask``: metres from the silhouette's centroid,
                 x to the right in the image and y up.
@@ -82,7 +90,7 @@ class TopDownView:
             raise ViewError(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
         try:
             silhouette = read_silhouette(mask)
-            action = LeverUp(np.asarray(contact, dtype=float), np.asarray(direction, dtype=float))
+            action = LeverUp(contact, direction)
         except (ShapeError, ActionError) as error:
             raise ViewError(str(error)) from error
         origin = silhouette_origin(silhouette)
@@ -101,7 +109,7 @@ class TopDownView:
         points: Float[np.ndarray, "k 3"],
         minimal_height: float = MINIMAL_HEIGHT,
         close_holes: bool = True,
-    ) -> Self:
+    ) -> "TopDownView":
         """The view of a point cloud, as depth cameras see it.
 
         Args:
@@ -128,11 +136,11 @@ class TopDownView:
 
     def to_pixels(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
         """Pixels (row, column) of points in the action frame [m]; pixel centres are whole numbers."""
-        return _pixels_of(points)
+        return _pixels_of(points, self.metres_per_pixel)
 
     def to_metres(self, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
         """Points in the action frame [m] of pixel coordinates (row, column)."""
-        return _metres_of(pixels)
+        return _metres_of(pixels, self.metres_per_pixel)
 
     def contour(self) -> Float[np.ndarray, "k 2"]:
         """Outline of the largest object in the mask, counter-clockwise in the action frame [m]."""
@@ -140,15 +148,19 @@ class TopDownView:
             raise ViewError("the view's mask is empty: it has no contour")
         _, labels, stats, _ = cv2.connectedComponentsWithStats(self.mask.astype(np.uint8), connectivity=8)
         largest = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-        return _metres_of(mask_outline(largest)[::-1])
+        return self.to_metres(mask_outline(largest)[::-1])
 
 
-def _pixels_of(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
-    return np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5]) - points / METRES_PER_PIXEL
+def _pixels_of(
+    points: Float[np.ndarray, "k 2"], metres_per_pixel: float = METRES_PER_PIXEL
+) -> Float[np.ndarray, "k 2"]:
+    return CONTACT_PIXEL - points / metres_per_pixel
 
 
-def _metres_of(pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-    return (np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5]) - pixels) * METRES_PER_PIXEL
+def _metres_of(
+    pixels: Float[np.ndarray, "*batch 2"], metres_per_pixel: float = METRES_PER_PIXEL
+) -> Float[np.ndarray, "*batch 2"]:
+    return (CONTACT_PIXEL - pixels) * metres_per_pixel
 
 
 def _pixel_centres() -> Float[np.ndarray, "128 128 2"]:

@@ -1,9 +1,9 @@
 """Objects given as closed triangle meshes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any
 
 import numpy as np
 import shapely
@@ -11,29 +11,36 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError
-from foretrace.geometry import convex_hull, inward_normals, polygon_area
+from foretrace.geometry import Numbers, convex_hull, inward_normals, polygon_area
 from foretrace.objects.model import (
     BEVEL,
     Bevel,
     MassProperties,
     ObjectModel,
     check_size,
-    largest_distance,
     read_only,
 )
-
-if TYPE_CHECKING:
-    import trimesh
+from foretrace.objects.silhouette import simplify_outline
 
 OUTLINE_TOLERANCE = 0.0005
 """How far the outline's polygon may leave the mesh's projection [m]."""
 FOOT_HEIGHT = 0.0005
 """Points of the mesh below this height are taken to stand on the table [m]."""
-CONCAVITY = 0.03
-"""Threshold of the convex decomposition: the largest concavity left in a piece, relative to the mesh."""
+DECOMPOSITION: dict[str, Any] = {
+    "threshold": 0.04,
+    "preprocess_mode": "off",
+    "mcts_iterations": 60,
+    "mcts_max_depth": 2,
+    "mcts_nodes": 12,
+    "resolution": 800,
+    "seed": 0,
+}
+"""Settings of the convex decomposition: concavity left in a piece, relative to the mesh, and a short search.
+
+The mesh is known to be watertight, so it is cut as it is, not remeshed first."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class MeshObject(ObjectModel):
     """A closed triangle mesh of uniform density, standing as its file has it.
 
@@ -49,67 +56,26 @@ class MeshObject(ObjectModel):
     """Vertices in the object frame [m]."""
     faces: Int[np.ndarray, "f 3"]
     """Vertex indices of each triangle."""
-    bevel: Bevel = BEVEL
+    bevel: Bevel
     """Chamfer of the collision pieces' lower rim."""
-    corners: Float[np.ndarray, "n 2"] = field(init=False, repr=False)
+    corners: Float[np.ndarray, "n 2"]
     """Outline of the mesh seen from above, simplified, counter-clockwise [m]."""
-    height: float = field(init=False)
+    height: float
     """Largest height above the table [m]."""
 
-    def __post_init__(self) -> None:
-        mesh = self._check_mesh()
+    def __init__(self, vertices: Numbers, faces: Numbers, bevel: Bevel = BEVEL) -> None:
+        mesh = check_mesh(vertices, faces)
         shift = np.array([*mesh.center_mass[:2], mesh.bounds[0, 2]])
         # A mesh that lies right already is kept to the last digit: a stored object comes back as it was.
-        vertices = mesh.vertices if np.abs(shift).max() < 1e-9 else mesh.vertices - shift
-        object.__setattr__(self, "vertices", read_only(vertices))
+        in_place = mesh.vertices if np.abs(shift).max() < 1e-9 else mesh.vertices - shift
+        object.__setattr__(self, "vertices", read_only(in_place))
         object.__setattr__(self, "faces", read_only(mesh.faces, np.int64))
+        object.__setattr__(self, "bevel", bevel)
         object.__setattr__(self, "height", float(self.vertices[:, 2].max()))
-        triangles = flat_polygons(self.vertices[self.faces])
-        outline = shapely.union_all(triangles[shapely.area(triangles) > 0]).buffer(0)
-        parts = shapely.get_parts(outline)
-        largest = parts[np.argmax(shapely.area(parts))]
-        corners = shapely.get_coordinates(shapely.Polygon(largest.exterior).simplify(OUTLINE_TOLERANCE))[:-1]
-        object.__setattr__(
-            self, "corners", read_only(corners if polygon_area(corners) > 0 else corners[::-1])
-        )
-
-    def _check_mesh(self) -> "trimesh.Trimesh":
-        vertices, faces = np.asarray(self.vertices, dtype=float), np.asarray(self.faces)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-            raise ShapeError(
-                f"mesh has vertices {vertices.shape} and faces {faces.shape}: expected (v, 3) and (f, 3)"
-            )
-        if len(vertices) == 0 or len(faces) == 0:
-            raise ShapeError(
-                f"mesh with {len(vertices)} vertices and {len(faces)} faces is empty: give a closed surface"
-            )
-        if not np.isfinite(vertices).all():
-            bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-            raise ShapeError(
-                f"mesh vertex {bad} is {vertices[bad].tolist()}: every coordinate must be finite"
-            )
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise ShapeError(
-                f"mesh faces name vertices {faces.min()} to {faces.max()}: there are {len(vertices)}"
-            )
-        check_size(largest_distance(np.unique(vertices, axis=0)), float(np.ptp(vertices[:, 2])))
-        import trimesh  # a second to import, and most objects are prisms
-
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        if not mesh.is_watertight:
-            _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-            raise ShapeError(
-                f"mesh is not watertight ({int((uses != 2).sum())} edges without exactly two faces): "
-                "close its holes in a mesh editor"
-            )
-        if not mesh.is_winding_consistent:
-            trimesh.repair.fix_winding(mesh)
-        if mesh.volume < 0:
-            mesh.invert()
-        return mesh
+        object.__setattr__(self, "corners", read_only(project_outline(self.vertices[self.faces])))
 
     @classmethod
-    def load(cls, path: str | Path, scale: float = 1.0, bevel: Bevel = BEVEL) -> Self:
+    def load(cls, path: str | Path, scale: float = 1.0, bevel: Bevel = BEVEL) -> "MeshObject":
         """A mesh from an STL or OBJ file.
 
         Args:
@@ -187,14 +153,14 @@ class MeshObject(ObjectModel):
         }
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Self:
+    def from_dict(cls, values: dict[str, Any]) -> "MeshObject":
         """The object that ``to_dict`` described."""
         return cls(
             np.array(values["vertices"]), np.array(values["faces"], dtype=np.int64), Bevel(*values["bevel"])
         )
 
     @cached_property
-    def _mesh(self) -> "trimesh.Trimesh":
+    def _mesh(self) -> Any:
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
@@ -207,9 +173,7 @@ class MeshObject(ObjectModel):
             import coacd
 
             coacd.set_log_level("error")
-            found = coacd.run_coacd(
-                coacd.Mesh(self.vertices, self.faces), threshold=CONCAVITY, preprocess_mode="auto", seed=0
-            )
+            found = coacd.run_coacd(coacd.Mesh(self.vertices, self.faces), **DECOMPOSITION)
             pieces = [np.asarray(vertices, dtype=float) for vertices, _ in found]
         rim = convex_hull(np.array(self.corners))
         normals = inward_normals(rim)
@@ -234,6 +198,57 @@ class MeshObject(ObjectModel):
         return read_only(
             shapely.get_coordinates(shapely.shortest_line(foot, shapely.points(self.corners)))[::2]
         )
+
+
+def check_mesh(vertices: Numbers, faces: Numbers) -> Any:
+    """A ``trimesh.Trimesh`` of usable size, closed, with its faces' normals outwards.
+
+    Raises:
+        ShapeError: naming the fault, if the mesh bounds no body.
+    """
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ShapeError(
+            f"mesh has vertices {vertices.shape} and faces {faces.shape}: expected (v, 3) and (f, 3)"
+        )
+    if len(vertices) == 0 or len(faces) == 0:
+        raise ShapeError(
+            f"mesh with {len(vertices)} vertices and {len(faces)} faces is empty: give a closed surface"
+        )
+    if not np.isfinite(vertices).all():
+        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise ShapeError(f"mesh vertex {bad} is {vertices[bad].tolist()}: every coordinate must be finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ShapeError(
+            f"mesh faces name vertices {faces.min()} to {faces.max()}: there are {len(vertices)}"
+        )
+    extents = np.ptp(vertices, axis=0)
+    check_size(float(extents.max()), float(extents[2]))
+    import trimesh  # a second to import, and most objects are prisms
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if not mesh.is_watertight:
+        _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+        raise ShapeError(
+            f"mesh is not watertight ({int((uses != 2).sum())} edges without exactly two faces): "
+            "close its holes in a mesh editor"
+        )
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def project_outline(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "n 2"]:
+    """Outline of the triangles seen from above, counter-clockwise, simplified and without holes [m]."""
+    flat = flat_polygons(triangles)
+    # On a grid of 0.1 um, so that rounding leaves no slivers between neighbours.
+    union = shapely.union_all(flat[shapely.area(flat) > 1e-12], grid_size=1e-7)
+    parts = shapely.get_parts(union)
+    ring = shapely.get_coordinates(shapely.get_exterior_ring(parts[np.argmax(shapely.area(parts))]))[:-1]
+    corners = ring[simplify_outline(ring, OUTLINE_TOLERANCE)]
+    return corners if polygon_area(corners) > 0 else corners[::-1]
 
 
 def flat_polygons(triangles: Float[np.ndarray, "f 3 3"]) -> np.ndarray:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError
+from foretrace.geometry import convex_hull
 
 SIZE_LIMITS = (0.01, 1.0)
 """Smallest and largest believable length of an object [m]: anything else is a wrong unit or scale."""
@@ -90,11 +91,10 @@ class ObjectModel(ABC):
         return largest_distance(self.corners)
 
 
-def largest_distance(points: Float[np.ndarray, "n dimensions"]) -> float:
+def largest_distance(points: Float[np.ndarray, "n 2"]) -> float:
     """Largest distance between any two points [m]."""
-    if len(points) > 100:
-        points = points[ConvexHull(points).vertices]
-    return float(np.linalg.norm(points[:, None] - points[None], axis=-1).max())
+    hull = convex_hull(points)
+    return float(np.linalg.norm(hull[:, None] - hull[None], axis=-1).max())
 
 
 def check_size(size: float, height: float) -> None:

@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Float, Shaped
-from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from foretrace.errors import ShapeError
-from foretrace.geometry import clip_polygon, convex_hull, inward_normals, is_convex, polygon_area
+from foretrace.geometry import Numbers, clip_polygon, convex_hull, inward_normals, is_convex, polygon_area
 from foretrace.objects.model import (
     BEVEL,
     Bevel,
@@ -29,8 +29,8 @@ CIRCLE_RADIUS = 0.10
 """Radius of the circle on which sampled corners lie [m] (paper, section 4)."""
 CORNER_COUNTS = (3, 4, 5, 6, 7, 8, 9, 10)
 """Corner counts of the paper's objects (section 4)."""
-LARGEST_GAP = np.deg2rad(170.0)
-"""Largest angle between neighbouring sampled corners [rad]: keeps the centre 8.7 mm inside."""
+LARGEST_GAP = np.deg2rad(165.0)
+"""Largest angle between neighbouring sampled corners [rad]: keeps the centre 13 mm inside."""
 SMALLEST_GAP = np.deg2rad(12.0)
 """Smallest angle between neighbouring sampled corners [rad]: no edge under 2.1 cm."""
 SAME_CORNER = 1e-6
@@ -39,7 +39,7 @@ SMALLEST_PIECE = 1e-7
 """Convex parts below this area are left out [m^2]: collision meshes need a volume."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Prism(ObjectModel):
     """A polygon extruded upwards, standing on a bottom face that a bevel makes smaller than the outline.
 
@@ -57,10 +57,10 @@ class Prism(ObjectModel):
     bevel: Bevel = BEVEL
     """Chamfer of the lower rim."""
 
-    def __post_init__(self) -> None:
-        corners = check_polygon(self.corners)
-        object.__setattr__(self, "corners", corners)
-        object.__setattr__(self, "height", float(self.height))
+    def __init__(self, corners: Numbers, height: float = DEFAULT_HEIGHT, bevel: Bevel = BEVEL) -> None:
+        object.__setattr__(self, "corners", check_polygon(corners))
+        object.__setattr__(self, "height", float(height))
+        object.__setattr__(self, "bevel", bevel)
         check_size(self.size, self.height)
         if self.bevel.height >= self.height:
             raise ShapeError(
@@ -70,7 +70,7 @@ class Prism(ObjectModel):
         if shapely.is_empty(self._bottom):
             raise ShapeError(
                 f"bevel of width {self.bevel.width} m leaves no bottom face (widest inner circle has radius "
-                f"{inner_radius(corners):.4g} m): pass a narrower bevel=Bevel(width, height) or NO_BEVEL"
+                f"{inner_radius(self.corners):.4g} m): pass a narrower bevel=Bevel(width, height) or NO_BEVEL"
             )
 
     @classmethod
@@ -81,12 +81,12 @@ class Prism(ObjectModel):
         height: float = DEFAULT_HEIGHT,
         bevel: Bevel | None = None,
         tolerance: float | None = None,
-    ) -> Self:
+    ) -> "Prism":
         """The prism whose outline is a silhouette.
 
         Args:
-            mask: the object not 0 (or True), the background 0. Holes are filled; specks below 1 % of the
-                object's area are ignored.
+            mask: the object white (or True) on black. Holes are filled; specks below 1 % of the object's
+                area are ignored.
             metres_per_pixel: scale of the image [m].
             height: height of the prism [m].
             bevel: chamfer of the lower rim; by default the usual one, narrowed for thin objects to half
@@ -140,9 +140,9 @@ class Prism(ObjectModel):
         }
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Self:
+    def from_dict(cls, values: dict[str, Any]) -> "Prism":
         """The prism that ``to_dict`` described."""
-        return cls(np.array(values["corners"]), values["height"], Bevel(*values["bevel"]))
+        return cls(values["corners"], values["height"], Bevel(*values["bevel"]))
 
     @cached_property
     def _polygon(self) -> shapely.Polygon:
@@ -201,7 +201,8 @@ class Prism(ObjectModel):
         before = np.roll(normals, 1, axis=0)
         # The mitre point m solves normal . m = normal . corner + width for both edges of the corner.
         bisector = normals + before
-        mitred = self.corners + bisector * (self.bevel.width / (1 + (normals * before).sum(axis=1)))[:, None]
+        opening = np.maximum(1 + (normals * before).sum(axis=1), 1e-9)  # vanishes at an infinitely sharp tip
+        mitred = self.corners + bisector * (self.bevel.width / opening)[:, None]
         inset = shapely.points(mitred)
         near = shapely.distance(inset, self._bottom) < SAME_CORNER
         nearest = shapely.get_coordinates(shapely.shortest_line(self._bottom, shapely.points(self.corners)))[
@@ -210,7 +211,7 @@ class Prism(ObjectModel):
         return read_only(np.where(near[:, None], mitred, nearest))
 
 
-def check_polygon(corners: ArrayLike) -> Float[np.ndarray, "n 2"]:
+def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     """A simple polygon's corners, counter-clockwise and read-only [m].
 
     Raises:
@@ -227,12 +228,11 @@ def check_polygon(corners: ArrayLike) -> Float[np.ndarray, "n 2"]:
     if not np.isfinite(corners).all():
         bad = int(np.flatnonzero(~np.isfinite(corners).all(axis=1))[0])
         raise ShapeError(f"corner {bad} is {corners[bad].tolist()}: every coordinate must be finite")
-    first, second = np.triu_indices(len(corners), 1)
-    same = np.linalg.norm(corners[first] - corners[second], axis=1) < SAME_CORNER
-    if same.any():
-        k = int(np.flatnonzero(same)[0])
+    same = KDTree(corners).query_pairs(SAME_CORNER)
+    if same:
+        first, second = min(same)
         raise ShapeError(
-            f"corners {first[k]} and {second[k]} are both {corners[first[k]].tolist()}: "
+            f"corners {first} and {second} are both {corners[first].tolist()}: "
             "give each corner once, without closing the polygon"
         )
     size = largest_distance(corners)
@@ -302,7 +302,7 @@ def directed_edges(indices: list[int]) -> list[tuple[int, int]]:
 def sample_prism(rng: np.random.Generator, num_corners: int) -> Prism:
     """One of the paper's random objects (section 4): corners at random angles on a circle of 10 cm radius.
 
-    The circle's centre lies strictly inside: draws with a gap over 170 or under 12 degrees are rejected.
+    The circle's centre lies strictly inside: draws with a gap over 165 or under 12 degrees are rejected.
 
     Raises:
         ShapeError: if so many corners cannot keep their smallest gap, or fewer than three are asked for.

@@ -16,22 +16,27 @@ TOLERANCE = 0.001
 """How far a polygon may leave the outline that it simplifies [m]."""
 TOLERANCE_PIXELS = 0.75
 """The same in pixels, whichever is larger: less would draw the pixels' own steps."""
+BLUNTED = 3.0
+"""How many pixels of a sharp corner may be missing in the image and are put back [pixels]."""
 
 
 def read_silhouette(mask: Shaped[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
     """The one object in a binary image, without specks and with its holes filled.
 
     Args:
-        mask: the object not 0 (or True), the background 0.
+        mask: the object white (or True) on black; grey is white above half of the brightest value.
 
     Raises:
         ShapeError: if there is no object, more than one, or one that the border cuts off.
     """
+    if mask.ndim != 2:
+        raise ShapeError(f"mask has shape {mask.shape}: give one channel, rows x columns")
     if mask.size == 0 or not mask.any():
         raise ShapeError(
             f"mask of {mask.shape[1]} x {mask.shape[0]} pixels is empty: draw the object white on black"
         )
-    binary = (np.nan_to_num(mask) != 0).astype(np.uint8)
+    grey = np.nan_to_num(mask.astype(np.float32))
+    binary = (grey > 0.5 * grey.max()).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
     num_objects = int((areas >= SPECK * areas.max()).sum())
@@ -86,10 +91,6 @@ def silhouette_polygon(
     )  # (column, -row), counter-clockwise
     pixels = max((TOLERANCE if tolerance is None else tolerance) / metres_per_pixel, TOLERANCE_PIXELS)
     chosen = simplify_outline(outline, pixels)
-    if len(chosen) < 3:
-        raise ShapeError(
-            f"object of {int(silhouette.sum())} pixels is too small for an outline: use a finer image"
-        )
     corners = outline[chosen]
     refined = refine_corners(outline, chosen, pixels)
     if shapely.Polygon(refined).is_valid:
@@ -101,8 +102,7 @@ def simplify_outline(outline: Float[np.ndarray, "k 2"], tolerance: float) -> lis
     """Indices of the outline points that a polygon within the tolerance needs (Douglas and Peucker)."""
     start = int(np.argmax(np.linalg.norm(outline - outline.mean(axis=0), axis=1)))
     order = np.roll(np.arange(len(outline)), -start)
-    closed = shapely.LineString(outline[[*order, start]])
-    kept = shapely.get_coordinates(closed.simplify(tolerance, preserve_topology=True))[:-1]
+    kept = shapely.get_coordinates(shapely.Polygon(outline[order]).simplify(tolerance))[:-1]
     index_of = {tuple(point): k for k, point in enumerate(outline.tolist())}
     return [index_of[tuple(point)] for point in kept.tolist()]
 
@@ -110,21 +110,51 @@ def simplify_outline(outline: Float[np.ndarray, "k 2"], tolerance: float) -> lis
 def refine_corners(
     outline: Float[np.ndarray, "k 2"], chosen: list[int], tolerance: float
 ) -> Float[np.ndarray, "n 2"]:
-    """Corners where lines fitted to neighbouring sides meet; a corner that would move far stays."""
-    anchors, directions = [], []
-    for start, stop in zip(chosen, [*chosen[1:], chosen[0] + len(outline)], strict=True):
-        indices = np.arange(start, stop + 1 if stop > start else stop + len(outline) + 1) % len(outline)
-        # The outline's points at a corner belong to neither side.
-        side = outline[indices[1:-1]] if len(indices) > 4 else outline[indices]
-        anchors.append(side.mean(axis=0))
-        directions.append(np.linalg.svd(side - anchors[-1])[2][0])
-    corners = outline[chosen].copy()
-    for k in range(len(chosen)):
-        turn = float(cross(directions[k - 1], directions[k]))
-        if abs(turn) < 0.05:
-            continue
-        along = float(cross(anchors[k] - anchors[k - 1], directions[k])) / turn
-        meeting = anchors[k - 1] + along * directions[k - 1]
-        if np.linalg.norm(meeting - corners[k]) <= 2 * tolerance:
-            corners[k] = meeting
+    """Corners where lines fitted to neighbouring sides meet; a corner that would move far stays.
+
+    A short side between two lines that meet close to it is a corner that the pixels have blunted: it is
+    dropped. All in pixels.
+    """
+    reach = max(1.5 * tolerance, BLUNTED)
+    stops = [*chosen[1:], chosen[0]]
+    sides = [fit_line(outline, start, stop) for start, stop in zip(chosen, stops, strict=True)]
+    lengths = np.linalg.norm(outline[stops] - outline[chosen], axis=1)
+    kept: list[int] = []
+    for k in range(len(sides)):
+        after = sides[(k + 1) % len(sides)]
+        before = sides[k - 1]
+        blunted = lengths[k] < 2 * tolerance and (k == 0 or kept[-1:] == [k - 1])
+        meeting = meeting_point(before, after) if blunted else None
+        middle = outline[[chosen[k], stops[k]]].mean(axis=0)
+        if meeting is None or np.linalg.norm(meeting - middle) > reach:
+            kept.append(k)
+    if len(kept) < 3:
+        kept = list(range(len(sides)))
+    corners = outline[[chosen[k] for k in kept]]
+    for i, k in enumerate(kept):
+        meeting = meeting_point(sides[kept[i - 1]], sides[k])
+        if meeting is not None and np.linalg.norm(meeting - corners[i]) <= reach:
+            corners[i] = meeting
     return corners
+
+
+Line = tuple[np.ndarray, np.ndarray]
+"""A point of the line and its unit direction."""
+
+
+def fit_line(outline: Float[np.ndarray, "k 2"], start: int, stop: int) -> Line:
+    """The line nearest to the outline's points between two indices, in the sense of least squares."""
+    indices = np.arange(start, stop + 1 if stop > start else stop + len(outline) + 1) % len(outline)
+    # The points at a corner belong to neither side.
+    points = outline[indices[1:-1]] if len(indices) > 4 else outline[indices]
+    anchor = points.mean(axis=0)
+    scatter = (points - anchor).T @ (points - anchor)
+    return anchor, np.linalg.eigh(scatter)[1][:, 1]
+
+
+def meeting_point(first: Line, second: Line) -> Float[np.ndarray, "2"] | None:
+    """Where two lines cross, or None where they are nearly parallel."""
+    turn = float(cross(first[1], second[1]))
+    if abs(turn) < 0.05:
+        return None
+    return first[0] + first[1] * float(cross(second[0] - first[0], second[1])) / turn
