@@ -1,0 +1,360 @@
+"""Pictures of interactions: what was seen, what was done, what happened, and what was imagined.
+
+Nothing here simulates or trains. All is drawn in the action frame: x along the action, y to the left, z up.
+The colours are Okabe and Ito's, which colour-blind readers can tell apart; line styles differ too.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import matplotlib as mpl
+import numpy as np
+import shapely
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from foretrace.actions import LeverUp
+from foretrace.errors import DatasetError, PredictionError
+from foretrace.geometry import matrix_to_pose, pose_to_matrix, transform_points
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.record import Interaction, Outcome
+from foretrace.objects import ObjectModel
+
+INK = "#22262e"
+GREY = "#8b93a1"
+TRUTH_COLOR = "#009e73"
+PREDICTION_COLORS = ("#d55e00", "#0072b2", "#cc79a7", "#e69f00")
+PREDICTION_LINES = ("--", "-.", ":", (0, (5, 1, 1, 1)))
+OBJECT_COLOR = "#dde6f0"
+OBJECT_EDGE = "#4a6078"
+TOOL_COLOR = "#6b5b4b"
+SUPPORT_COLOR = "#0072b2"
+OUTCOME_COLORS = {
+    Outcome.LEVERED: "#009e73",
+    Outcome.SLIPPED: "#e69f00",
+    Outcome.TUMBLED: "#d55e00",
+    Outcome.ROLLED: "#cc79a7",
+    Outcome.MISSED: "#8b93a1",
+    Outcome.FAILED: "#22262e",
+}
+STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 9.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.8,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+}
+TOOL_REACH = 0.12
+"""How much of the screwdriver is drawn, from its tip backwards [m]."""
+ARROW_LENGTH = 0.045
+"""Length of the arrow that shows the action [m]."""
+CM = 100.0
+DPI = 150
+
+
+class Trace(NamedTuple):
+    """A path of the centre of mass, and how it is drawn."""
+
+    name: str
+    path: np.ndarray
+    color: str
+    style: Any
+    width: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a picture shows, whether it was observed or only imagined."""
+
+    obj: ObjectModel
+    """The object, in its own frame."""
+    placement: Float[np.ndarray, "4 4"]
+    """Object frame -> action frame at rest."""
+    times: Float[np.ndarray, " time"]
+    """Sample times [s]."""
+    pose: Float[np.ndarray, "time 7"]
+    """Object frame over time: position [m], quaternion (w, x, y, z)."""
+    predictions: Mapping[str, Float[np.ndarray, "_ 3"]]
+    """Imagined paths of the centre of mass [m], by name."""
+    com: Float[np.ndarray, "time 3"] | None = None
+    """Observed path of the centre of mass [m]."""
+    tool: Float[np.ndarray, "time 7"] | None = None
+    """Blade tip over time."""
+    support_points: Float[np.ndarray, "2 2"] | None = None
+    """The two observed support points [m]."""
+    slip_index: int | None = None
+    """First sample off the blade."""
+    title: str = ""
+    """What it is, in a line."""
+
+    @classmethod
+    def observed(cls, interaction: Interaction, predictions: Mapping[str, np.ndarray] | None = None) -> Self:
+        """An interaction that happened, with what had been imagined about it.
+
+        Raises:
+            DatasetError: Its simulation failed: there is nothing to draw.
+        """
+        effect, num_corners = interaction.effect, len(interaction.object.corners)
+        if len(effect.times) == 0:
+            raise DatasetError(
+                f"interaction {interaction.id} failed: it has no motion to draw; choose another"
+            )
+        known = np.isfinite(effect.support_points).all()
+        return cls(
+            obj=interaction.object,
+            placement=interaction.action.T_action_object,
+            times=effect.times,
+            pose=effect.pose_trajectory,
+            predictions=_checked(predictions or {}),
+            com=effect.com_trajectory,
+            tool=effect.tool_trajectory,
+            support_points=effect.support_points if known else None,
+            slip_index=effect.slip_index,
+            title=f"Interaction {interaction.id}: {num_corners} corners, {effect.outcome}",
+        )
+
+    @classmethod
+    def imagined(
+        cls,
+        obj: ObjectModel,
+        action: LeverUp,
+        times: Float[np.ndarray, " time"],
+        predictions: Mapping[str, Float[np.ndarray, "_ 3"]],
+        pose: Float[np.ndarray, "time 7"] | None = None,
+    ) -> Self:
+        """A lever-up that has not happened; without imagined poses the object is drawn at rest."""
+        at_rest = np.tile(matrix_to_pose(action.T_action_object), (len(times), 1))
+        return cls(
+            obj=obj,
+            placement=action.T_action_object,
+            times=times,
+            pose=at_rest if pose is None else pose,
+            predictions=_checked(predictions),
+            title=f"Imagined lever-up, {len(obj.corners)} corners",
+        )
+
+    @property
+    def outline(self) -> Float[np.ndarray, "n 2"]:
+        """Outline of the object at rest, in the action frame [m]."""
+        return self.obj.corners @ self.placement[:2, :2].T + self.placement[:2, 3]
+
+    def paths(self) -> list[Trace]:
+        """Everything to trace; the observed path first."""
+        traced = [] if self.com is None else [Trace("observed", self.com, TRUTH_COLOR, "-", 2.4)]
+        for k, (name, path) in enumerate(self.predictions.items()):
+            k %= len(PREDICTION_COLORS)
+            traced.append(Trace(name, path, PREDICTION_COLORS[k], PREDICTION_LINES[k], 1.8))
+        return traced
+
+    def times_of(self, path: np.ndarray) -> Float[np.ndarray, " samples"]:
+        """Times of a path that may be longer than what was observed [s]."""
+        if len(path) <= len(self.times):
+            return self.times[: len(path)]
+        period = self.times[1] - self.times[0] if len(self.times) > 1 else 1.0
+        return self.times[0] + period * np.arange(len(path))
+
+
+def _checked(predictions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    for name, path in predictions.items():
+        if np.ndim(path) != 2 or np.shape(path)[1] != 3 or len(path) == 0:
+            raise PredictionError(f"path of {name} has shape {np.shape(path)}: expected (time, 3) in metres")
+    return dict(predictions)
+
+
+def interaction_figure(
+    interaction: Interaction, predictions: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None
+) -> Figure:
+    """One interaction from above, from the side and over time, with what was imagined beside what happened.
+
+    Args:
+        interaction: What happened.
+        predictions: Imagined paths of the centre of mass in the action frame [m], by the predictor's name.
+
+    Raises:
+        DatasetError: The interaction failed and has no motion.
+        PredictionError: A path is not (time, 3).
+    """
+    return scene_figure(Scene.observed(interaction, predictions))
+
+
+def scene_figure(scene: Scene) -> Figure:
+    """The picture of `interaction_figure` for any scene."""
+    with mpl.rc_context(STYLE):
+        fig = Figure(figsize=(13.2, 4.9), dpi=DPI, layout="constrained")
+        grid = fig.add_gridspec(3, 3, width_ratios=[1.0, 1.28, 1.05])
+        draw_from_above(fig.add_subplot(grid[:, 0]), scene)
+        draw_from_the_side(fig.add_subplot(grid[:, 1]), scene)
+        first = fig.add_subplot(grid[0, 2])
+        axes = [first, *(fig.add_subplot(grid[k, 2], sharex=first) for k in (1, 2))]
+        draw_over_time(axes, scene)
+        fig.suptitle(scene.title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+        fig.legend(handles=legend_of(scene), loc="outside lower center", ncols=2, fontsize=9)
+    return fig
+
+
+def legend_of(scene: Scene) -> list[Line2D]:
+    """Legend entries of a scene; predictions carry their error where the truth is known."""
+    handles = []
+    for name, path, color, style, width in scene.paths():
+        label = f"centre of mass, {name}"
+        if scene.com is not None and path is not scene.com:
+            n = min(len(path), len(scene.com))
+            error = np.linalg.norm(path[:n] - scene.com[:n], axis=1) * CM
+            label += f" (off by {error.mean():.2f} cm on average, {error[-1]:.2f} cm at the end)"
+        handles.append(Line2D([], [], color=color, linestyle=style, linewidth=width, label=label))
+    if scene.support_points is not None:
+        handles.append(_support_handle())
+    return handles
+
+
+def _support_handle() -> Line2D:
+    return Line2D([], [], color=SUPPORT_COLOR, marker="o", markersize=5, label="support points")
+
+
+def draw_from_above(ax: Axes, scene: Scene, margin: float = 0.025) -> None:
+    """The object at rest, the action's arrow, support points and paths; the action points up."""
+    outline = scene.outline * CM
+    ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=1.4)
+    arrow = {"arrowstyle": "-|>,head_width=0.35,head_length=0.7", "color": TOOL_COLOR, "linewidth": 2.6}
+    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops={**arrow, "shrinkA": 0, "shrinkB": 0})
+    if scene.support_points is not None:
+        points = scene.support_points * CM
+        ax.plot(points[:, 1], points[:, 0], color=SUPPORT_COLOR, linewidth=2, marker="o", zorder=3)
+    for _, path, color, style, width in scene.paths():
+        ax.plot(path[:, 1] * CM, path[:, 0] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
+        ax.plot(path[-1, 1] * CM, path[-1, 0] * CM, color=color, marker="o", markersize=4.5, zorder=5)
+    paths = [path[:, :2] for _, path, *_ in scene.paths()]
+    seen = np.concatenate([scene.outline, [[-ARROW_LENGTH, 0]], *paths])
+    low, high = (seen.min(axis=0) - margin) * CM, (seen.max(axis=0) + margin) * CM
+    ax.set(xlim=(high[1], low[1]), ylim=(low[0], high[0]), aspect="equal", title="From above")
+    ax.set(xlabel="y, to the left [cm]", ylabel="x, along the action [cm]", anchor="N")
+
+
+def draw_from_the_side(ax: Axes, scene: Scene, instants: int = 5) -> None:
+    """Silhouette of object and blade at several instants, from light to dark, and the paths in x and z."""
+    lifted = np.flatnonzero(np.abs(scene.pose - scene.pose[0]).max(axis=1) > 1e-3)
+    first = int(lifted[0]) if len(lifted) else 0
+    last = len(scene.pose) - 1
+    chosen = np.unique(np.linspace(first, last, instants).round().astype(int))
+    for strength, k in zip(np.linspace(0.25, 1.0, len(chosen)), chosen, strict=True):
+        for ring in silhouette(scene.obj, scene.pose[k]):
+            ax.fill(*ring.T * CM, facecolor=OBJECT_COLOR, alpha=0.35, linewidth=0)
+            ax.plot(*ring.T * CM, color=OBJECT_EDGE, alpha=strength, linewidth=1.2)
+        if scene.tool is not None:
+            line = tool_line(scene.tool[k])[:, [0, 2]] * CM
+            ax.plot(*line.T, color=TOOL_COLOR, alpha=strength, linewidth=2.4)
+    for _, path, color, style, width in scene.paths():
+        ax.plot(path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
+        ax.plot(path[-1, 0] * CM, path[-1, 2] * CM, color=color, marker="o", markersize=4.5, zorder=5)
+    (left, right), top = ax.get_xlim(), max(ax.get_ylim()[1], 6.0)
+    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
+    ax.axhspan(-50, 0, color="#f1f2f4", zorder=-1)
+    if scene.tool is not None:
+        x, _, z = tool_line(scene.tool[-1])[1] * CM
+        ax.text(x, z, "  blade", color=TOOL_COLOR)
+    ax.set(xlim=(left, right), ylim=(-1.2, top), aspect="equal", title="From the side")
+    ax.set(xlabel="x, along the action [cm]", ylabel="z, up [cm]", anchor="N")
+
+
+def draw_over_time(axes: list[Axes], scene: Scene) -> None:
+    """The centre of mass over time, one axis for each coordinate."""
+    for k, (ax, name) in enumerate(zip(axes, ("x", "y", "z"), strict=True)):
+        for _, path, color, style, width in scene.paths():
+            ax.plot(scene.times_of(path), path[:, k] * CM, color=color, linestyle=style, linewidth=width)
+        if scene.slip_index is not None and scene.slip_index < len(scene.times):
+            ax.axvline(scene.times[scene.slip_index], color=GREY, linestyle=":", linewidth=1.2)
+            if k == 0:
+                place = (scene.times[scene.slip_index], 1.0)
+                ax.annotate("slip", place, xycoords=("data", "axes fraction"), fontsize=8.5, color=INK,
+                            xytext=(3, -9), textcoords="offset points")  # fmt: skip
+        low, high = ax.get_ylim()
+        middle, half = (low + high) / 2, max((high - low) / 2, 0.5)  # a path that hardly moves shall look so
+        ax.set(ylabel=f"{name} [cm]", ylim=(middle - half, middle + half))
+        ax.grid(axis="y", color="#e6e8ec", linewidth=0.8)
+        ax.tick_params(labelbottom=k == 2)
+    axes[0].set_title("Centre of mass over time")
+    axes[2].set_xlabel("time [s]")
+    axes[0].figure.align_ylabels(axes)
+
+
+def silhouette(obj: ObjectModel, pose: Float[np.ndarray, "7"]) -> list[Float[np.ndarray, "_ 2"]]:
+    """Outlines of an object seen from the side: closed rings of x and z in the action frame [m]."""
+    transform = pose_to_matrix(pose)
+    hulls = [
+        shapely.MultiPoint(transform_points(transform, piece)[:, [0, 2]]).convex_hull
+        for piece in obj.convex_pieces()
+    ]
+    whole = shapely.union_all(hulls).buffer(1e-6)  # closes hairlines between neighbouring pieces
+    return [shapely.get_coordinates(part.exterior) for part in getattr(whole, "geoms", [whole])]
+
+
+def tool_line(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2 3"]:
+    """The screwdriver as a line from its tip backwards, in the action frame [m]."""
+    return transform_points(pose_to_matrix(pose), np.array([[0.0, 0, 0], [-TOOL_REACH, 0, 0]]))
+
+
+def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
+    """Many interactions from above at one scale: outline, action, support points and path by outcome.
+
+    Args:
+        dataset: What to show; if it is larger than the sheet, it is sampled evenly.
+        columns: Pictures side by side.
+        rows: Pictures one above another.
+
+    Raises:
+        DatasetError: There is nothing to show.
+    """
+    if len(dataset) == 0:
+        raise DatasetError(f"{dataset.path} has no interaction to show: filter less, or simulate")
+    shown = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), columns * rows)).round().astype(int))
+    columns = min(columns, len(shown))
+    rows = -(-len(shown) // columns)
+    counts = dataset.outcomes()
+    with mpl.rc_context(STYLE):
+        fig = Figure(figsize=(1.55 * columns + 0.3, 1.7 * rows + 1.0), dpi=DPI, layout="constrained")
+        for cell, k in enumerate(shown):
+            _draw_cell(fig.add_subplot(rows, columns, cell + 1), dataset[int(k)])
+        title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
+        fig.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+        handles = [
+            Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
+            for name, count in counts.items()
+        ]
+        handles.append(_support_handle())
+        fig.legend(handles=handles, loc="outside lower center", ncols=8)
+    return fig
+
+
+def _draw_cell(ax: Axes, interaction: Interaction) -> None:
+    """A stamp-sized view from above, the same scale for all."""
+    effect = interaction.effect
+    color = OUTCOME_COLORS[effect.outcome]
+    placement = interaction.action.T_action_object
+    outline = (interaction.object.corners @ placement[:2, :2].T + placement[:2, 3]) * CM
+    ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=0.9)
+    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 1.5, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+    points = effect.support_points * CM
+    ax.plot(points[:, 1], points[:, 0], color=SUPPORT_COLOR, linewidth=1.5, marker="o", markersize=3)
+    path = effect.com_trajectory * CM
+    ax.plot(path[:, 1], path[:, 0], color=color, linewidth=2.2)
+    middle = (outline[:, 1].min() + outline[:, 1].max()) / 2
+    ax.plot([middle + 10.5, middle + 0.5], [-6.5, -6.5], color=GREY, linewidth=1.5)
+    ax.set(xlim=(middle + 11, middle - 11), ylim=(-7, 21), aspect="equal")
+    ax.axis("off")
+    ax.set_title(f"{interaction.id}  {effect.outcome}", fontsize=8, color=INK, fontweight="normal", pad=2)

@@ -1,0 +1,167 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import factories
+from foretrace import cli
+from foretrace.interactions import storage
+from foretrace.interactions.dataset import Dataset
+
+
+@pytest.fixture
+def fake_physics(monkeypatch):
+    def fake_simulate(obj, action, config, *, seed, id):
+        return factories.fake_lever_up(obj, action, id=id, seed=seed)
+
+    monkeypatch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake_simulate)
+
+
+@pytest.fixture
+def folder(fake_physics, tmp_path) -> Path:
+    assert cli.main(["simulate", "--out", str(tmp_path / "data"), "--objects", "8", "--workers", "1"]) == 0
+    return tmp_path / "data"
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def test_simulate_writes_a_data_set_and_says_where(fake_physics, tmp_path, capsys):
+    folder = tmp_path / "data"
+    assert cli.main(["simulate", "--out", str(folder), "--objects", "8", "--workers", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "levered     104  100.0 %" in printed
+    assert printed.splitlines()[-1] == f"data set: {folder}"
+    dataset = Dataset.open(folder)
+    assert len(dataset) == 104
+    assert dataset.manifest["configuration"]["simulation"]["embodiment"] == "arm"
+
+
+def test_options_reach_the_configuration(fake_physics, tmp_path):
+    options = ["--objects", "2", "--contacts-per-edge", "1", "--seed", "7", "--embodiment", "tool"]
+    assert cli.main(["simulate", "--out", str(tmp_path), "--workers", "1", *options]) == 0
+    configuration = storage.read_manifest(tmp_path)["configuration"]
+    assert configuration["objects"] == 2
+    assert configuration["contacts_per_edge"] == 1
+    assert configuration["seed"] == 7
+    assert configuration["simulation"]["embodiment"] == "tool"
+    assert configuration["simulation"]["engine"] == "mujoco"
+    assert len(Dataset.open(tmp_path)) == 7
+
+
+def test_an_error_is_one_line_and_exit_status_2(folder, capsys):
+    capsys.readouterr()
+    assert cli.main(["simulate", "--out", str(folder), "--objects", "9"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("foretrace: error: ")
+    assert printed.err.count("\n") == 1
+    assert "objects = 8" in printed.err
+    assert cli.main(["doctor", str(folder / "nowhere")]) == 2
+    assert "no data set at" in capsys.readouterr().err
+
+
+def test_doctor_finds_repairs_and_tells_by_its_exit_status(folder, capsys):
+    assert cli.main(["doctor", str(folder)]) == 0
+    assert "104 interactions, no problems left" in capsys.readouterr().out
+    (folder / storage.shard_name(1)).write_bytes(b"not parquet")
+    assert cli.main(["doctor", str(folder)]) == 1
+    assert f"found: {storage.shard_name(1)}: shard" in capsys.readouterr().out
+    assert cli.main(["doctor", str(folder), "--repair"]) == 1
+    printed = capsys.readouterr().out
+    assert "repaired: " in printed
+    assert "100 interactions, 1 problem left" in printed
+    assert cli.main(["simulate", "--out", str(folder), "--objects", "8", "--workers", "1"]) == 0
+    assert cli.main(["doctor", str(folder)]) == 0
+
+
+def test_a_warning_is_one_line(folder, capsys):
+    manifest = storage.read_manifest(folder)
+    del manifest["shards"][storage.shard_name(1)]
+    storage.write_manifest(folder, manifest)
+    capsys.readouterr()
+    assert cli.main(["show", str(folder), "--out", str(folder / "sheet.png")]) == 0
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"foretrace: warning: {folder} is not finished: 1 of 2 shards are missing")
+    assert printed.count("\n") == 1
+
+
+def test_show_draws_sheet_picture_and_animation(folder, capsys):
+    capsys.readouterr()
+    assert cli.main(["show", str(folder)]) == 0
+    assert capsys.readouterr().out == f"{folder}/figures/contact-sheet.png\n"
+    assert cli.main(["show", str(folder), "--id", "3", "--out", str(folder / "deep" / "one.svg")]) == 0
+    assert (folder / "deep" / "one.svg").stat().st_size > 1000
+    assert (folder / "figures" / "contact-sheet.png").stat().st_size > 1000
+
+
+def test_show_refuses_what_it_cannot_draw(folder, capsys):
+    assert cli.main(["show", str(folder), "--out", "sheet.doc"]) == 2
+    assert "sheet.doc: choose a name that ends in .png" in capsys.readouterr().err
+    assert cli.main(["show", str(folder), "--out", "sheet.gif"]) == 2
+    assert "choose the interaction with --id" in capsys.readouterr().err
+    assert cli.main(["show", str(folder), "--id", "104"]) == 2
+    assert "no interaction 104" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["doctor", "--help"]])
+def test_help_names_the_options(arguments, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(arguments)
+    assert stopped.value.code == 0
+    printed = capsys.readouterr().out
+    assert ("simulate" if arguments == ["--help"] else "--") in printed
+
+
+def test_an_unknown_command_is_refused(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["levitate"])
+    assert stopped.value.code == 2
+
+
+def test_help_imports_nothing_slow():
+    code = (
+        "import sys; from foretrace.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "slow = {'torch', 'mujoco', 'matplotlib', 'pandas', 'pyarrow', 'scipy', 'cv2', 'joblib'}\n"
+        "sys.exit(' '.join(slow & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=environment(), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "foretrace",
+        "simulate",
+        "--out",
+        str(tmp_path / "data"),
+        "--workers",
+        "2",
+    ]
+    process = subprocess.Popen(
+        [*command, "--embodiment", "tool"],
+        env=environment(),
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "data" / storage.shard_name(0)).exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # what a terminal does: to the parent and its workers
+    _, printed = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in printed
+    assert printed.splitlines()[-1].startswith("foretrace: interrupted; what is done stays in")
+    assert (tmp_path / "data" / storage.shard_name(0)).exists()
