@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
@@ -22,6 +22,7 @@ from foretrace.objects import (
     Prism,
     object_from_dict,
     paper_objects,
+    read_silhouette,
     sample_prism,
 )
 from foretrace.objects.prism import convex_parts
@@ -347,6 +348,26 @@ def test_thin_objects_get_a_narrower_bevel():
     assert Prism.from_mask(square_mask(60), 0.002, height=0.004).bevel.height == pytest.approx(0.002)
 
 
+@settings(max_examples=8, deadline=None)
+@given(seeds)
+@example(51)
+@example(122)
+def test_random_blobs_become_prisms(seed):
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(size=(160, 200)), (0, 0), rng.uniform(4, 14))
+    blobs = np.pad(noise > rng.uniform(-0.3, 0.5) * noise.std(), 20).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(blobs)
+    blob = labels == 1 + np.argmax(stats[1:, cv2.CC_STAT_AREA])
+    rows, columns = np.nonzero(blob)
+    metres_per_pixel = 0.18 / max(np.ptp(rows), np.ptp(columns))
+    prism = Prism.from_mask(blob, metres_per_pixel)
+    assert np.isfinite(prism.support_corners).all()
+    assert (np.linalg.eigvalsh(prism.mass_properties(500.0).inertia) > 0).all()
+    filled = read_silhouette(blob).sum() * metres_per_pixel**2
+    assert polygon_area(prism.corners) == pytest.approx(filled, rel=0.03)
+    assert object_from_dict(prism.to_dict()).to_dict() == prism.to_dict()
+
+
 TWO_OBJECTS = np.hstack([square_mask(20), square_mask(20)])
 BAD_MASKS = {
     "empty": (np.zeros((20, 20), dtype=bool), 0.005),
@@ -452,6 +473,15 @@ def test_ball_stands_on_a_point():
     obj = mesh_object(trimesh.creation.icosphere(subdivisions=3, radius=0.05))
     assert np.linalg.norm(obj.support_corners, axis=1).max() < 0.01
     assert obj.height_at(np.array([[0.0, 0.0], [0.06, 0.0]])).tolist() == pytest.approx([0.1, 0.0])
+
+
+def test_bevel_of_a_mesh_fits_it():
+    plate = mesh_object(trimesh.creation.box((0.1, 0.1, 0.002)))
+    assert plate.bevel.height == pytest.approx(0.001)
+    with pytest.raises(ShapeError, match=r"bevel of 0\.004 m x 0\.003 m on a mesh of height 0\.002 m"):
+        mesh_object(trimesh.creation.box((0.1, 0.1, 0.002)), bevel=Bevel(0.004, 0.003))
+    with pytest.raises(ShapeError, match=r"inner radius 0\.01 m"):
+        mesh_object(trimesh.creation.box((0.1, 0.02, 0.02)), bevel=Bevel(0.02, 0.003))
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj"])

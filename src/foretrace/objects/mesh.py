@@ -13,11 +13,12 @@ from scipy.spatial import ConvexHull
 from foretrace.errors import ShapeError
 from foretrace.geometry import Numbers, convex_hull, inward_normals, polygon_area
 from foretrace.objects.model import (
-    BEVEL,
     Bevel,
     MassProperties,
     ObjectModel,
     check_size,
+    fitting_bevel,
+    inner_radius,
     read_only,
 )
 from foretrace.objects.silhouette import simplify_outline
@@ -63,25 +64,30 @@ class MeshObject(ObjectModel):
     height: float
     """Largest height above the table [m]."""
 
-    def __init__(self, vertices: Numbers, faces: Numbers, bevel: Bevel = BEVEL) -> None:
+    def __init__(self, vertices: Numbers, faces: Numbers, bevel: Bevel | None = None) -> None:
         mesh = check_mesh(vertices, faces)
         shift = np.array([*mesh.center_mass[:2], mesh.bounds[0, 2]])
         # A mesh that lies right already is kept to the last digit: a stored object comes back as it was.
         in_place = mesh.vertices if np.abs(shift).max() < 1e-9 else mesh.vertices - shift
         object.__setattr__(self, "vertices", read_only(in_place))
         object.__setattr__(self, "faces", read_only(mesh.faces, np.int64))
-        object.__setattr__(self, "bevel", bevel)
         object.__setattr__(self, "height", float(self.vertices[:, 2].max()))
         object.__setattr__(self, "corners", read_only(project_outline(self.vertices[self.faces])))
+        object.__setattr__(self, "bevel", bevel or fitting_bevel(self.corners, self.height))
+        if self.bevel.height >= self.height or self.bevel.width >= inner_radius(self.corners):
+            raise ShapeError(
+                f"bevel of {self.bevel.width} m x {self.bevel.height} m on a mesh of height {self.height:.4g} m, "
+                f"inner radius {inner_radius(self.corners):.4g} m: leave it out, and a fitting one is chosen"
+            )
 
     @classmethod
-    def load(cls, path: str | Path, scale: float = 1.0, bevel: Bevel = BEVEL) -> "MeshObject":
+    def load(cls, path: str | Path, scale: float = 1.0, bevel: Bevel | None = None) -> "MeshObject":
         """A mesh from an STL or OBJ file.
 
         Args:
             path: the file; z must point up.
             scale: metres per unit of the file, e.g. 0.001 for a file in millimetres.
-            bevel: chamfer of the collision pieces' lower rim.
+            bevel: chamfer of the collision pieces' lower rim; by default one that fits.
 
         Raises:
             ShapeError: if the file cannot be read or the mesh is not usable.

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
@@ -108,6 +109,21 @@ def check_size(size: float, height: float) -> None:
             raise ShapeError(
                 f"object of {name} {value:.4g} m: expected {low} to {high} m; check unit (metres) or scale"
             )
+
+
+def inner_radius(corners: Float[np.ndarray, "n 2"]) -> float:
+    """Radius of the widest circle inside a polygon [m]."""
+    return float(shapely.length(shapely.maximum_inscribed_circle(shapely.Polygon(corners))))
+
+
+def fitting_bevel(corners: Float[np.ndarray, "n 2"], height: float) -> Bevel:
+    """The usual bevel, scaled down to what a slender or flat object bears.
+
+    Its width is at most half the radius of the widest circle inside the outline, its height at most half
+    the object's.
+    """
+    scale = min(1.0, 0.5 * inner_radius(corners) / BEVEL.width, 0.5 * height / BEVEL.height)
+    return Bevel(BEVEL.width * scale, BEVEL.height * scale)
 
 
 def read_only(values: Any, dtype: type = float) -> np.ndarray:

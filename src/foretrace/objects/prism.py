@@ -18,6 +18,8 @@ from foretrace.objects.model import (
     ObjectModel,
     check_size,
     convex_mass_properties,
+    fitting_bevel,
+    inner_radius,
     largest_distance,
     read_only,
 )
@@ -89,8 +91,7 @@ class Prism(ObjectModel):
                 area are ignored.
             metres_per_pixel: scale of the image [m].
             height: height of the prism [m].
-            bevel: chamfer of the lower rim; by default the usual one, narrowed for thin objects to half
-                the radius of the widest circle inside.
+            bevel: chamfer of the lower rim; by default the usual one, smaller for slender or flat objects.
             tolerance: how far the polygon may leave the outline [m]; 1 mm by default, never below 0.75 pixel.
 
         Returns:
@@ -100,10 +101,7 @@ class Prism(ObjectModel):
             ShapeError: for a mask that is empty, shows several objects or an object cut off by the border.
         """
         corners = silhouette_polygon(mask, metres_per_pixel, tolerance)
-        if bevel is None:
-            narrowest = min(1.0, 0.5 * inner_radius(corners) / BEVEL.width, 0.5 * height / BEVEL.height)
-            bevel = Bevel(BEVEL.width * narrowest, BEVEL.height * narrowest)
-        return cls(corners, height, bevel)
+        return cls(corners, height, bevel or fitting_bevel(corners, height))
 
     def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:
         """Vertices of the convex parts, in the object frame [m].
@@ -247,11 +245,6 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     if polygon_area(corners) < 0:
         corners = np.roll(corners[::-1], 1, axis=0)
     return read_only(corners)
-
-
-def inner_radius(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Radius of the widest circle inside a polygon [m]."""
-    return float(shapely.length(shapely.maximum_inscribed_circle(shapely.Polygon(corners))))
 
 
 def clip_edges(

@@ -85,15 +85,13 @@ def silhouette_polygon(
     if not (np.isfinite(metres_per_pixel) and metres_per_pixel > 0):
         raise ShapeError(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
     silhouette = read_silhouette(mask)
-    rows_columns = mask_outline(silhouette) - silhouette_origin(silhouette)
-    outline = np.ascontiguousarray(
-        rows_columns[::-1, ::-1] * [1.0, -1.0]
-    )  # (column, -row), counter-clockwise
+    rows, columns = (mask_outline(silhouette) - silhouette_origin(silhouette)).T
+    outline = np.column_stack([columns, -rows])[::-1]  # x, y in pixels, counter-clockwise
     pixels = max((TOLERANCE if tolerance is None else tolerance) / metres_per_pixel, TOLERANCE_PIXELS)
     chosen = simplify_outline(outline, pixels)
     corners = outline[chosen]
     refined = refine_corners(outline, chosen, pixels)
-    if shapely.Polygon(refined).is_valid:
+    if len(refined) >= 3 and shapely.Polygon(refined).is_valid:
         corners = refined
     return corners * metres_per_pixel
 
@@ -135,7 +133,8 @@ def refine_corners(
         meeting = meeting_point(sides[kept[i - 1]], sides[k])
         if meeting is not None and np.linalg.norm(meeting - corners[i]) <= reach:
             corners[i] = meeting
-    return corners
+    # Lines of three sides in a row may meet in one point.
+    return corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > 0.5]
 
 
 Line = tuple[np.ndarray, np.ndarray]
