@@ -76,8 +76,8 @@ class MeshObject(ObjectModel):
         object.__setattr__(self, "bevel", bevel or fitting_bevel(self.corners, self.height))
         if self.bevel.height >= self.height or self.bevel.width >= inner_radius(self.corners):
             raise ShapeError(
-                f"bevel of {self.bevel.width} m x {self.bevel.height} m on a mesh of height {self.height:.4g} m, "
-                f"inner radius {inner_radius(self.corners):.4g} m: leave it out, and a fitting one is chosen"
+                f"bevel of {self.bevel.width} m x {self.bevel.height} m on a mesh of height {self.height:.4g} m "
+                f"and inner radius {inner_radius(self.corners):.4g} m: leave it out, and a fitting one is chosen"
             )
 
     @classmethod
