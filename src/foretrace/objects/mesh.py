@@ -74,10 +74,11 @@ class MeshObject(ObjectModel):
         object.__setattr__(self, "height", float(self.vertices[:, 2].max()))
         object.__setattr__(self, "corners", read_only(project_outline(self.vertices[self.faces])))
         object.__setattr__(self, "bevel", bevel or fitting_bevel(self.corners, self.height))
-        if self.bevel.height >= self.height or self.bevel.width >= inner_radius(self.corners):
+        radius = inner_radius(self.corners)
+        if self.bevel.height >= self.height or self.bevel.width >= radius:
             raise ShapeError(
-                f"bevel of {self.bevel.width} m x {self.bevel.height} m on a mesh of height {self.height:.4g} m "
-                f"and inner radius {inner_radius(self.corners):.4g} m: leave it out, and a fitting one is chosen"
+                f"bevel of {self.bevel.width} m x {self.bevel.height} m on a mesh of height "
+                f"{self.height:.4g} m and inner radius {radius:.4g} m: leave it out for one that fits"
             )
 
     @classmethod
