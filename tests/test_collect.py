@@ -20,6 +20,7 @@ from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import Interaction, Outcome
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
+from foretrace.simulation.lever_up import SimulationConfig
 
 SMALL = CollectConfig(objects=16)
 """208 trials: three shards."""
@@ -268,3 +269,14 @@ def test_progress_is_reported_in_plain_lines_without_a_terminal(tmp_path, monkey
     assert lines[0].startswith("10 of 104 interactions, ")
     assert "s left: 10 levered" in lines[0]
     assert "102 levered, 2 failed" in lines[-1]
+
+
+def test_a_real_interaction_is_reproducible_alone_from_its_id(tmp_path):
+    config = CollectConfig(objects=1, simulation=SimulationConfig(embodiment="tool"))
+    collect(config, tmp_path, workers=1, console=quiet())
+    stored = Dataset.open(tmp_path)[4]
+    alone = simulate_trial(config, 4)
+    for name in ("pose_trajectory", "com_trajectory", "tool_trajectory", "support_points"):
+        np.testing.assert_array_equal(getattr(stored.effect, name), getattr(alone.effect, name))
+    assert stored.effect.outcome == alone.effect.outcome
+    assert stored.provenance == alone.provenance

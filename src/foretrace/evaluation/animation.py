@@ -35,14 +35,14 @@ LAST_FRAME_TIME = 1.2
 def interaction_animation(
     interaction: Interaction,
     path: str | Path,
-    predictions: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    predictions: Mapping[str, np.ndarray] | None = None,
 ) -> Path:
     """Write an interaction as a GIF or MP4 in real time, with what was imagined beside what happened.
 
     Args:
         interaction: What happened.
         path: The file to write; its ending decides between ``.gif`` and ``.mp4``.
-        predictions: Imagined paths of the centre of mass in the action frame [m], by the predictor's name.
+        predictions: Imagined paths (time, 3) of the centre of mass in the action frame [m], by name.
 
     Raises:
         DatasetError: The interaction failed and has no motion.

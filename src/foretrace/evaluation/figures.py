@@ -6,7 +6,7 @@ The colours are Okabe and Ito's, which colour-blind readers can tell apart; line
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -89,8 +89,8 @@ class Scene:
     """Sample times [s]."""
     pose: Float[np.ndarray, "time 7"]
     """Object frame over time: position [m], quaternion (w, x, y, z)."""
-    predictions: Mapping[str, Float[np.ndarray, "_ 3"]]
-    """Imagined paths of the centre of mass [m], by name."""
+    predictions: Mapping[str, np.ndarray]
+    """Imagined paths (time, 3) of the centre of mass [m], by name."""
     com: Float[np.ndarray, "time 3"] | None = None
     """Observed path of the centre of mass [m]."""
     tool: Float[np.ndarray, "time 7"] | None = None
@@ -103,7 +103,9 @@ class Scene:
     """What it is, in a line."""
 
     @classmethod
-    def observed(cls, interaction: Interaction, predictions: Mapping[str, np.ndarray] | None = None) -> Self:
+    def observed(
+        cls, interaction: Interaction, predictions: Mapping[str, np.ndarray] | None = None
+    ) -> "Scene":
         """An interaction that happened, with what had been imagined about it.
 
         Raises:
@@ -134,9 +136,9 @@ class Scene:
         obj: ObjectModel,
         action: LeverUp,
         times: Float[np.ndarray, " time"],
-        predictions: Mapping[str, Float[np.ndarray, "_ 3"]],
+        predictions: Mapping[str, np.ndarray],
         pose: Float[np.ndarray, "time 7"] | None = None,
-    ) -> Self:
+    ) -> "Scene":
         """A lever-up that has not happened; without imagined poses the object is drawn at rest."""
         at_rest = np.tile(matrix_to_pose(action.T_action_object), (len(times), 1))
         return cls(
@@ -177,13 +179,13 @@ def _checked(predictions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def interaction_figure(
-    interaction: Interaction, predictions: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None
+    interaction: Interaction, predictions: Mapping[str, np.ndarray] | None = None
 ) -> Figure:
     """One interaction from above, from the side and over time, with what was imagined beside what happened.
 
     Args:
         interaction: What happened.
-        predictions: Imagined paths of the centre of mass in the action frame [m], by the predictor's name.
+        predictions: Imagined paths (time, 3) of the centre of mass in the action frame [m], by name.
 
     Raises:
         DatasetError: The interaction failed and has no motion.
