@@ -122,15 +122,15 @@ class ToolPath:
         ActionError: if a value is out of its range.
     """
 
-    insertion: float = 0.036
+    insertion: float = 0.022
     """How far the blade tip is pushed under the object, past the contact point [m]."""
-    arc_radius: float = 0.12
+    arc_radius: float = 0.14
     """Radius of the arc on which the tip is lifted [m]."""
-    sweep: float = 0.81
+    sweep: float = 0.75
     """Angle of that arc [rad]."""
-    pitch: float = 0.40
+    pitch: float = 0.28
     """Pitch of the blade while it is pushed in, tip down [rad]."""
-    pitch_gain: float = 0.13
+    pitch_gain: float = 0.8
     """By how much the pitch grows per angle of the arc."""
     standoff: float = 0.008
     """Distance of the tip from the contact point at the start [m]."""

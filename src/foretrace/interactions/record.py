@@ -62,11 +62,11 @@ class Effect:
 class Physics:
     """The physical constants of one interaction."""
 
-    density: float = 500.0
+    density: float = 600.0
     """Density of the object [kg/m^3]."""
-    friction: float = 0.6
+    friction: float = 0.8
     """Coulomb friction coefficient between object and table."""
-    tool_friction: float = 0.6
+    tool_friction: float = 0.3
     """Coulomb friction coefficient between object and blade."""
 
 

@@ -23,9 +23,9 @@ HEIGHT_LIMITS = (0.001, 1.0)
 class Bevel:
     """A chamfer all round an object's lower rim, which lets a blade get under it."""
 
-    width: float = 0.005
+    width: float = 0.009
     """How far the bottom face lies inside the outline [m]."""
-    height: float = 0.005
+    height: float = 0.003
     """Height above the table at which the outline is reached [m]."""
 
     def __post_init__(self) -> None:

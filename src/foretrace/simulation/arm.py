@@ -50,7 +50,7 @@ SERVO_DAMPING = (1000.0, 1000.0, 450.0, 70.0, 70.0, 70.0)
 """Derivative gain of the joint servos [N m s/rad], near critical damping."""
 
 LINK_CAPSULES = (
-    ((0.0, 0.0, 0.05), (0.0, 0.0, 0.16), 0.075),
+    ((0.0, 0.0, 0.09), (0.0, 0.0, 0.16), 0.075),
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.18), 0.07),
     ((0.0, 0.0, 0.18), (-0.612, 0.0, 0.18), 0.058),
     ((0.0, 0.0, 0.05), (-0.5723, 0.0, 0.05), 0.048),
@@ -67,7 +67,9 @@ HOLDER_LENGTH = 0.07
 """From the flange to the screwdriver's handle, along the flange's axis [m]."""
 BASE_POSITION = (-0.85, 0.0, 0.0)
 """Arm base in the action frame [m]; its axes are the action frame's."""
-HOME = (np.pi, -2.0, 2.2, -1.6, -np.pi / 2, np.pi / 2)
+MAX_IK_STEP = 0.2
+"""Largest change of a joint in one iteration of inverse kinematics [rad]."""
+HOME = (2.9, -1.2, 2.3, -3.0, -1.5, 1.3)
 """Posture from which inverse kinematics starts [rad]: elbow up, hand behind and above the contact point."""
 
 
@@ -195,11 +197,13 @@ def solve_inverse_kinematics(
         mujoco.mju_subQuat(error[3:], target_quat, quat)
         error[3:] = data.site_xmat[site].reshape(3, 3) @ error[3:]
         if np.abs(error).max() < tolerance:
-            return (q + np.pi) % (2 * np.pi) - np.pi if np.abs(q).max() > JOINT_LIMIT else q
+            return q
         mujoco.mj_jacSite(model, data, jac_pos, jac_rot, site)
         J = np.vstack([jac_pos, jac_rot])[:, columns]  # (6, 6)
         damping = 1e-3 * min(1.0, float(np.linalg.norm(error)))
-        q = q + J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
+        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
+        # A bounded step stays in the branch of the start.
+        q = q + step * min(1.0, MAX_IK_STEP / float(np.abs(step).max()))
     x, y, z = T_action_tip[:3, 3]
     raise ActionError(
         f"the arm cannot bring the blade to ({x:.3f}, {y:.3f}, {z:.3f}) m: "
@@ -247,4 +251,3 @@ def _rotate(quat: Float[np.ndarray, " 4"], vector: Float[np.ndarray, " 3"]) -> F
     result = np.zeros(3)
     mujoco.mju_rotVecQuat(result, vector, quat)
     return result
-

@@ -1,7 +1,7 @@
 """The contract of a physics engine: play one lever-up, report what was seen."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -37,14 +37,13 @@ class Motion:
     """Whether the numbers blew up."""
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Plays lever-ups. Implementations are deterministic: equal arguments give equal motions."""
 
     name: str
 
-    def play(
-        self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics
-    ) -> Motion:
+    def play(self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics) -> Motion:
         """Plays one lever-up from the moment before the blade moves until the end of the path."""
         ...
 

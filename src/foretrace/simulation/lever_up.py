@@ -78,6 +78,7 @@ def simulate_lever_up(
     if config.camera == "exact":
         view = TopDownView.of(obj, action)
     else:
+        # Loads OpenGL, which the exact camera does without.
         from foretrace.simulation.camera import observe_view
 
         view = observe_view(obj, action, config.camera, seed=seed)
@@ -157,7 +158,9 @@ def _slip_index(lifted: Bool[np.ndarray, " time"], on_blade: Bool[np.ndarray, " 
     return int(lasting.argmax()) if lasting.any() else None
 
 
-def _outcome(angle: Float[np.ndarray, " time"], com_z: Float[np.ndarray, " time"], slip: int | None) -> Outcome:
+def _outcome(
+    angle: Float[np.ndarray, " time"], com_z: Float[np.ndarray, " time"], slip: int | None
+) -> Outcome:
     rise = com_z.max() - com_z[0]
     if angle.max() <= LIFTED_TILT:
         return Outcome.MISSED

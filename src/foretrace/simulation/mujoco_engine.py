@@ -55,9 +55,7 @@ class MujocoEngine:
 
     name = "mujoco"
 
-    def __init__(
-        self, embodiment: str = "arm", timestep: float = 0.002, sample_period: float = 0.05
-    ) -> None:
+    def __init__(self, embodiment: str = "arm", timestep: float = 0.002, sample_period: float = 0.05) -> None:
         if embodiment not in EMBODIMENTS:
             raise SimulationError(
                 f"embodiment {embodiment!r} is unknown: choose one of {', '.join(EMBODIMENTS)}"
@@ -70,9 +68,7 @@ class MujocoEngine:
         self.embodiment, self.timestep, self.sample_period = embodiment, timestep, sample_period
         self._scene: tuple[ObjectModel, Physics, Tool, mujoco.MjModel, mujoco.MjData] | None = None
 
-    def play(
-        self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics
-    ) -> Motion:
+    def play(self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics) -> Motion:
         """Plays one lever-up from the moment before the blade moves until the end of the path.
 
         Raises:
@@ -85,9 +81,7 @@ class MujocoEngine:
         data.qpos[7:] = control.start
         state = np.empty(mujoco.mj_stateSize(model, STATE))
         mujoco.mj_getState(model, data, state, STATE)
-        states, _ = rollout.rollout(
-            model, data, initial_state=state[None], control=control.setpoints[None]
-        )
+        states, _ = rollout.rollout(model, data, initial_state=state[None], control=control.setpoints[None])
         stride = round(self.sample_period / self.timestep)
         samples = np.vstack([state[None], states[0, stride - 1 :: stride]])
         return self._observe(model, data, samples, control)
@@ -161,12 +155,14 @@ def plan_control(
     tips = tip_transforms(path, np.arange(num_samples + 1) * sample_period)
     model = build_scene(None, Physics(), tool, embodiment, timestep).compile()
     if embodiment == "tool":
-        times, h = (1 + np.arange(num_steps)) * timestep, 1e-4
-        before, now, after = path.at(times - h), path.at(times), path.at(times + h)
-        velocity, acceleration = (after - before) / (2 * h), (after - 2 * now + before) / h**2
-        lead = 2 / CARRIAGE_FREQUENCY * velocity + acceleration / CARRIAGE_FREQUENCY**2
+        times = np.arange(-1, num_steps + 1) * timestep
+        positions = path.at(times)
+        velocity = np.diff(positions, axis=0) / timestep
+        acceleration = np.diff(velocity, axis=0) / timestep
+        # The integrator is implicit in the velocity: a step starts at one position and ends at the next speed.
+        lead = 2 / CARRIAGE_FREQUENCY * velocity[1:] + acceleration / CARRIAGE_FREQUENCY**2
         order = [model.joint(name).id for name in CARRIAGE_JOINTS]
-        return ControlPath(path.at(np.zeros(1))[0][order], (now + lead)[:, order], tips)
+        return ControlPath(positions[1, order], (positions[1:-1] + lead)[:, order], tips)
     period = arm.CONTROL_PERIOD
     steps_per_tick = round(period / timestep)
     num_ticks = -(-num_steps // steps_per_tick)
@@ -182,15 +178,15 @@ def plan_control(
             joint_path.accelerations[i],
         )
         mujoco.mj_inverse(model, data)
-        force = data.qfrc_inverse - servo[:, 2] * joint_path.velocities[i]
-        setpoints[i] = joint_path.positions[i] - force / servo[:, 1]
+        # The integrator is implicit in the velocity: forces see the step's first position and its last speed.
+        position = joint_path.positions[i] - timestep / 2 * joint_path.velocities[i]
+        velocity = joint_path.velocities[i] + timestep / 2 * joint_path.accelerations[i]
+        setpoints[i] = position - (data.qfrc_inverse - servo[:, 2] * velocity) / servo[:, 1]
     start = arm.solve_inverse_kinematics(model, tips[0], joint_path.positions[0])
     return ControlPath(start, np.repeat(setpoints[1:], steps_per_tick, axis=0)[:num_steps], tips)
 
 
-def tip_transforms(
-    path: ToolPath, times: Float[np.ndarray, " time"]
-) -> Float[np.ndarray, "time 4 4"]:
+def tip_transforms(path: ToolPath, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4 4"]:
     """Planned blade tip in the action frame: x along the blade, y to the left, z out of its upper face."""
     x, z, pitch = path.at(times).T
     pose = np.zeros((len(times), 7))

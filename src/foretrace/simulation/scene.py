@@ -13,14 +13,14 @@ from foretrace.simulation.arm import add_arm
 from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, TOOL_BIT, Tool, add_carriage
 
 EMBODIMENTS = ("arm", "tool")
-CONTACT_TIME = 0.01
+CONTACT_TIME = 0.015
 """Time constant of the contacts' spring and damper [s]; critically damped."""
 FRICTION_STIFFNESS = 10.0
 """How much stiffer contacts are along the surface than across it: keeps resting objects from creeping."""
 
 
 def build_scene(
-    obj: ObjectModel | None, physics: Physics, tool: Tool, embodiment: str, timestep: float
+    obj: ObjectModel | None, physics: Physics, tool: Tool, embodiment: str | None, timestep: float
 ) -> mujoco.MjSpec:
     """A table with the tool and, if given, an object.
 
@@ -28,11 +28,12 @@ def build_scene(
         obj: The object; None leaves the table empty.
         physics: Friction and density.
         tool: Dimensions of the screwdriver.
-        embodiment: ``arm`` or ``tool``.
+        embodiment: ``arm``, ``tool``, or None for a table without a tool.
         timestep: Time step of the simulation [s].
     """
     spec = mujoco.MjSpec()
     spec.modelname = "foretrace"
+    spec.compiler.degree = False
     option = spec.option
     option.timestep = timestep
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -41,10 +42,11 @@ def build_scene(
     # A diverged simulation must stay visible instead of being reset in silence.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.default.geom.solref = [CONTACT_TIME, 1.0]
-    spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
-    spec.visual.headlight.diffuse = [0.4, 0.4, 0.4]
+    spec.visual.headlight.ambient = [0.3, 0.3, 0.3]
+    spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     world = spec.worldbody
-    world.add_light(pos=[-0.3, -0.4, 1.6], dir=[0.2, 0.3, -1])
+    world.add_light(pos=[-0.3, -0.4, 1.6], dir=[0.2, 0.3, -1], diffuse=[0.4, 0.4, 0.4], specular=[0.1] * 3)
     world.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -58,7 +60,7 @@ def build_scene(
         _add_object(spec, obj, physics)
     if embodiment == "arm":
         add_arm(spec, tool, physics.tool_friction)
-    else:
+    elif embodiment == "tool":
         add_carriage(spec, tool, physics.tool_friction)
     return spec
 

@@ -24,7 +24,7 @@ CARRIAGE_FREQUENCY = 2 * np.pi * 30.0
 class Tool:
     """A flat-blade screwdriver."""
 
-    blade_width: float = 0.0125
+    blade_width: float = 0.0055
     """Width of the blade [m]."""
     blade_thickness: float = 0.001
     """Thickness of the blade [m]."""

@@ -1,0 +1,146 @@
+"""A simulated RGB-D camera above the table, about as good as a Kinect's."""
+
+import ctypes
+import os
+import sys
+import warnings
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+from mujoco.rendering.classic import gl_context
+
+from foretrace.actions import LeverUp
+from foretrace.errors import SimulationError
+from foretrace.geometry import matrix_to_pose
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.record import Physics
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import ObjectModel
+from foretrace.simulation.scene import build_scene
+from foretrace.simulation.tool import Tool
+
+CAMERAS = ("exact", "rgbd")
+MINIMAL_HEIGHT = 0.008
+"""Points lower than this are the table's, noise included [m]."""
+
+
+@dataclass(frozen=True)
+class RgbdFrame:
+    """One picture of an RGB-D camera."""
+
+    rgb: UInt8[np.ndarray, "rows columns 3"]
+    """Colour."""
+    depth: Float[np.ndarray, "rows columns"]
+    """Distance along the optical axis [m]."""
+    camera: PinholeCamera
+    """Intrinsics."""
+    T_action_camera: Float[np.ndarray, "4 4"]
+    """Pose of the camera in the action frame (camera frame: x right, y down, z forward)."""
+
+    def view(self) -> TopDownView:
+        """The picture seen from above: what every real depth image goes through, too."""
+        points = self.camera.deproject(self.depth, self.T_action_camera)
+        return TopDownView.from_points(points, MINIMAL_HEIGHT)
+
+
+@dataclass(frozen=True)
+class RgbdConfig:
+    """Where the camera hangs and how noisy its depth is."""
+
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    """Intrinsics; 57 x 45 degrees by default."""
+    position: tuple[float, float, float] = (0.1, 0.0, 0.75)
+    """Position in the action frame [m]; it looks straight down."""
+    noise: float = 1.0
+    """Scale of the axial noise that Nguyen et al. (2012) measured on a Kinect; 0 switches it off."""
+
+
+def take_rgbd(
+    obj: ObjectModel, action: LeverUp, config: RgbdConfig = RgbdConfig(), *, seed: int = 0
+) -> RgbdFrame:
+    """Renders the object on the table before the arm comes into the picture.
+
+    Args:
+        obj: The object.
+        action: The lever-up that places it.
+        config: The camera.
+        seed: Seed of the depth noise.
+
+    Raises:
+        SimulationError: If the machine can render neither with EGL nor with OSMesa.
+    """
+    camera = config.camera
+    spec = build_scene(obj, Physics(), Tool(), None, timestep=0.002)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
+    # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the picture.
+    spec.worldbody.add_camera(name="above", pos=config.position, quat=[np.sqrt(0.5), 0, 0, -np.sqrt(0.5)])
+    model = spec.compile()
+    model.cam_fovy[0] = np.rad2deg(2 * np.arctan(camera.height / 2 / camera.fy))
+    data = mujoco.MjData(model)
+    data.qpos[:7] = matrix_to_pose(action.T_action_object)
+    mujoco.mj_forward(model, data)
+    with make_renderer(model, camera.height, camera.width) as renderer:
+        renderer.update_scene(data, camera="above")
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        rgb = renderer.render().copy()
+        renderer.enable_depth_rendering()
+        depth = renderer.render().astype(float)
+    sigma = config.noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
+    depth += np.random.default_rng(seed).normal(size=depth.shape) * sigma
+    T = np.eye(4)
+    # The picture's rows run along -x and its columns along -y of the action frame, as in the top-down view.
+    T[:3, :3] = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
+    T[:3, 3] = config.position
+    return RgbdFrame(rgb, depth, camera, T)
+
+
+def observe_view(obj: ObjectModel, action: LeverUp, camera: str, *, seed: int = 0) -> TopDownView:
+    """The top-down view by one of CAMERAS: from exact geometry, or from a rendered depth image.
+
+    Raises:
+        SimulationError: If there is no such camera, or nothing to render with.
+    """
+    if camera == "exact":
+        return TopDownView.of(obj, action)
+    if camera == "rgbd":
+        return take_rgbd(obj, action, seed=seed).view()
+    raise SimulationError(f"camera {camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
+
+
+def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """A renderer that needs no display: EGL, or OSMesa where EGL is missing (it warns then).
+
+    The environment variable ``MUJOCO_GL`` overrides the choice.
+
+    Raises:
+        SimulationError: If neither is installed.
+    """
+    if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
+        if _loads("libEGL.so.1") and _loads("libOpenGL.so.0"):
+            from mujoco.egl import GLContext
+        elif _loads("libOSMesa.so.8") or _loads("libOSMesa.so.6"):
+            warnings.warn("EGL is not installed: rendering in software with OSMesa, slower", stacklevel=2)
+            from mujoco.osmesa import GLContext
+        else:
+            raise SimulationError(
+                "cannot render: neither EGL nor OSMesa is installed; install libegl1, libopengl0 and "
+                "libgl1-mesa-dri (or libosmesa6), or use the exact camera, which needs no rendering"
+            )
+        gl_context.GLContext = GLContext
+    try:
+        return mujoco.Renderer(model, height, width)
+    except (ImportError, RuntimeError, mujoco.FatalError) as error:
+        raise SimulationError(
+            f"cannot open a renderer ({error}): set MUJOCO_GL to egl or osmesa, or use the exact camera"
+        ) from error
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
