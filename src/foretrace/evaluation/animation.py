@@ -127,37 +127,37 @@ def _normal(face: np.ndarray) -> np.ndarray:
     return normal / max(np.linalg.norm(normal), 1e-12)
 
 
+def _faces_us(face: np.ndarray) -> bool:
+    return bool(project(_normal(face))[2] > 0)
+
+
+def _shaded(color: str, face: np.ndarray) -> np.ndarray:
+    """The colour of a face under the light."""
+    facing = max(float(_normal(face) @ LIGHT), 0.0)
+    return np.clip(np.array(to_rgb(color)) * (0.72 + 0.36 * facing), 0, 1)
+
+
 def _draw_stage(ax: Axes, scene: Scene, k: int) -> None:
-    """The table, the object's shadow, blade and object sorted by depth, and the paths up to sample ``k``."""
+    """The table, the object's shadow, object and blade, and the paths up to sample ``k``."""
     _draw_table(ax, scene)
     pose = pose_to_matrix(scene.pose[k])
-    solid = [transform_points(pose, face) for face in faces_of(scene.obj)]
-    shadow = convex_hull(np.concatenate(solid)[:, :2])
+    body = [transform_points(pose, face) for face in faces_of(scene.obj)]
+    shadow = convex_hull(np.concatenate(body)[:, :2])
     ground = project(np.column_stack([shadow, np.zeros(len(shadow))]))[:, :2] * CM
     ax.fill(*ground.T, color="#cfd3da", linewidth=0, zorder=1)
-    polygons, colors = [], []
+    faces = [(face, _shaded("#c3d3e6", face)) for face in body if _faces_us(face)]
     if scene.tool is not None:
         tip = pose_to_matrix(scene.tool[k])
-        solid += [transform_points(tip, face) for face in _tool_faces()]
-    num_tool = 0 if scene.tool is None else len(_tool_faces())
-    order = np.argsort([project(face)[:, 2].mean() for face in solid])
-    for i in order:
-        is_tool = i >= len(solid) - num_tool
-        normal = _normal(solid[i])
-        if not is_tool and project(normal)[2] <= 0:
-            continue  # the far side of the object
-        light = 0.72 + 0.28 * abs(float(normal @ LIGHT)) if is_tool else 0.66 + 0.34 * max(normal @ LIGHT, 0)
-        base = to_rgb(figures.TOOL_COLOR if is_tool else "#c3d3e6")
-        polygons.append(project(solid[i])[:, :2] * CM)
-        colors.append(np.clip(np.array(base) * light * 1.08, 0, 1))
-    edges = {"edgecolors": figures.OBJECT_EDGE, "linewidths": 0.9}
-    ax.add_collection(PolyCollection(polygons, facecolors=colors, zorder=2, **edges))
+        blade = [transform_points(tip, face) for face in _tool_faces()]
+        faces += [(face, _shaded(figures.TOOL_COLOR, face)) for face in blade]
+    faces.sort(key=lambda face: project(face[0])[:, 2].mean())  # the far ones first
+    polygons, colors = [project(face)[:, :2] * CM for face, _ in faces], [color for _, color in faces]
+    edges = colors if isinstance(scene.obj, MeshObject) else figures.OBJECT_EDGE  # no triangles on meshes
+    ax.add_collection(PolyCollection(polygons, facecolors=colors, edgecolors=edges, linewidths=0.9, zorder=2))
     if scene.support_points is not None:
         at_rest = np.column_stack([scene.support_points, np.zeros(2)])
-        carried = transform_points(pose @ invert_transform(scene.placement), at_rest)
-        ax.plot(
-            *project(carried)[:, :2].T * CM, color=figures.SUPPORT_COLOR, linewidth=2, marker="o", zorder=3
-        )
+        carried = project(transform_points(pose @ invert_transform(scene.placement), at_rest)) * CM
+        ax.plot(*carried[:, :2].T, color=figures.SUPPORT_COLOR, linewidth=2, marker="o", zorder=3)
     for _, path, color, style, width in scene.paths():
         faint, so_far = project(path)[:, :2] * CM, project(path[: k + 1])[:, :2] * CM
         ax.plot(*faint.T, color=color, linewidth=1.0, alpha=0.35, zorder=3)
