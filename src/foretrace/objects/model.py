@@ -52,6 +52,10 @@ class MassProperties:
     inertia: Float[np.ndarray, "3 3"]
     """Inertia about the centre of mass, along the object's axes [kg m^2]."""
 
+    def scaled(self, factor: float) -> "MassProperties":
+        """The same body, so many times as dense."""
+        return MassProperties(factor * self.mass, self.com, factor * self.inertia)
+
 
 class ObjectModel(ABC):
     """A rigid object of uniform density at rest on the table.

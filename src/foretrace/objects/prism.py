@@ -122,7 +122,7 @@ class Prism(ObjectModel):
 
     def mass_properties(self, density: float) -> MassProperties:
         """Exact mass, centre of mass and inertia of the bevelled body for a uniform density [kg/m^3]."""
-        return convex_mass_properties(self._pieces, density)
+        return self._unit_mass_properties.scaled(density)
 
     def height_at(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:
         """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
@@ -141,6 +141,10 @@ class Prism(ObjectModel):
     def from_dict(cls, values: dict[str, Any]) -> "Prism":
         """The prism that ``to_dict`` described."""
         return cls(values["corners"], values["height"], Bevel(*values["bevel"]))
+
+    @cached_property
+    def _unit_mass_properties(self) -> MassProperties:
+        return convex_mass_properties(self._pieces, density=1.0)
 
     @cached_property
     def _polygon(self) -> shapely.Polygon:
