@@ -1,1 +1,72 @@
-"""."""
+"""foretrace: predict how an object will move before the robot touches it.
+
+The names below are the public interface. They are imported on first use, so that ``import foretrace`` is quick and
+simulation never loads the learning libraries.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from foretrace.actions import LeverUp, ToolPath
+    from foretrace.errors import ForetraceError
+    from foretrace.interactions.dataset import Dataset, InteractionBatch
+    from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
+    from foretrace.interactions.topdown import TopDownView
+    from foretrace.objects import Bevel, MeshObject, Prism, paper_objects, sample_prism
+    from foretrace.predictor import TrainConfig, load_predictor, train_predictor
+    from foretrace.simulation.collect import CollectConfig, collect
+    from foretrace.simulation.lever_up import SimulationConfig, simulate, simulate_lever_up
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "foretrace.actions": ("LeverUp", "ToolPath"),
+    "foretrace.errors": ("ForetraceError",),
+    "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
+    "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
+    "foretrace.interactions.topdown": ("TopDownView",),
+    "foretrace.objects": ("Bevel", "MeshObject", "Prism", "paper_objects", "sample_prism"),
+    "foretrace.predictor": ("TrainConfig", "load_predictor", "train_predictor"),
+    "foretrace.simulation.collect": ("CollectConfig", "collect"),
+    "foretrace.simulation.lever_up": ("SimulationConfig", "simulate", "simulate_lever_up"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Bevel",
+    "CollectConfig",
+    "Dataset",
+    "Effect",
+    "ForetraceError",
+    "Interaction",
+    "InteractionBatch",
+    "LeverUp",
+    "MeshObject",
+    "Outcome",
+    "Physics",
+    "Prism",
+    "SimulationConfig",
+    "ToolPath",
+    "TopDownView",
+    "TrainConfig",
+    "collect",
+    "load_predictor",
+    "paper_objects",
+    "sample_prism",
+    "simulate",
+    "simulate_lever_up",
+    "train_predictor",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'foretrace' has no attribute {name!r}; it offers {', '.join(__all__)}")
+    value = getattr(import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

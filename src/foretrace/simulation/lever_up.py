@@ -100,6 +100,44 @@ def simulate_lever_up(
     )
 
 
+def simulate(
+    obj: ObjectModel,
+    action: LeverUp,
+    *,
+    engine: str = "mujoco",
+    embodiment: str = "arm",
+    camera: str = "exact",
+    seed: int = 0,
+    physics: Physics | None = None,
+    path: ToolPath | None = None,
+) -> Interaction:
+    """Simulates one lever-up; ``simulate_lever_up`` with the settings that people change spelled out.
+
+    Args:
+        obj: The object.
+        action: Where and which way it is levered up, in the object frame.
+        engine: Physics engine.
+        embodiment: ``arm``: the whole robot; ``tool``: the blade alone on the same path.
+        camera: ``exact``: the view from geometry; ``rgbd``: from a rendered depth image.
+        seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
+        physics: Friction and density, if not the usual ones.
+        path: The blade's path, if not the usual one.
+
+    Raises:
+        SimulationError: If engine, embodiment or camera is unknown.
+        ActionError: If the arm cannot follow the path.
+        ViewError: If the object does not fit in the view.
+    """
+    config = SimulationConfig(
+        engine=engine,
+        embodiment=embodiment,
+        camera=camera,
+        path=path or ToolPath(),
+        physics=physics or Physics(),
+    )
+    return simulate_lever_up(obj, action, config, seed=seed)
+
+
 def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -> Effect:
     """Turns what the engine saw into the record of an effect: outcome, slip and support points.
 
