@@ -1,7 +1,7 @@
 """The paper's predictor: a Long Short-Term Memory network over states and object features (section 3.1)."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -24,12 +24,7 @@ class LstmConfig:
     hidden: int = 256
     """LSTM units."""
     window: int = 15
-    """States that one training sequence shows."""
-    stride: int = 15
-    """Samples between the starts of neighbouring training sequences."""
-    memory: Literal["carried", "window"] = "carried"
-    """Whether a roll-out carries the LSTM's memory from the first state on, or reads the last ``window``
-    states anew in every iteration."""
+    """States per training sequence. The LSTM's memory is carried from window to window, its gradient is not."""
 
 
 class ProjectedLstm(nn.Module):
@@ -78,14 +73,27 @@ class ProjectedLstm(nn.Module):
         return leave.sigmoid() * cell.tanh(), cell
 
     def forward(
-        self, states: Float[Tensor, "batch time state"], projected: Float[Tensor, "batch gates"]
-    ) -> Float[Tensor, "batch time hidden"]:
-        """Outputs at every step of sequences that start without memory; fast to train."""
-        return _LstmSequence.apply(states, projected, self.weight_state, self.weight_hidden)
+        self,
+        states: Float[Tensor, "batch time state"],
+        projected: Float[Tensor, "batch gates"],
+        memory: tuple[Tensor, Tensor] | None = None,
+    ) -> tuple[Float[Tensor, "batch time hidden"], tuple[Tensor, Tensor]]:
+        """Outputs at every step of a sequence, and the memory after it; fast to train.
+
+        No gradient flows into ``memory``, nor from what is later made of the returned one.
+        """
+        if memory is None:
+            nothing = states.new_zeros(len(states), self.hidden)
+            memory = nothing, nothing
+        output, cell = (part.detach() for part in memory)
+        outputs, cell = _LstmSequence.apply(
+            states, projected, self.weight_state, self.weight_hidden, output, cell
+        )
+        return outputs, (outputs[:, -1].detach(), cell)
 
 
 class _LstmSequence(torch.autograd.Function):
-    """The whole sequence as one node of the graph.
+    """A sequence of steps as one node of the graph.
 
     Up to twice as fast on a CPU as letting autograd record each step: activations are overwritten in place,
     and the gradient of the recurrent weights is one large product over all steps.
@@ -93,19 +101,24 @@ class _LstmSequence(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, states: Tensor, projected: Tensor, weight_state: Tensor, weight_hidden: Tensor
-    ) -> Tensor:
+        ctx: Any,
+        states: Tensor,
+        projected: Tensor,
+        weight_state: Tensor,
+        weight_hidden: Tensor,
+        first_output: Tensor,
+        first_cell: Tensor,
+    ) -> tuple[Tensor, Tensor]:
         batch, time, _ = states.shape
         hidden = weight_hidden.shape[1]
         x = states.transpose(0, 1)  # (time, batch, state)
-        outputs = x.new_zeros(time + 1, batch, hidden)
-        cells = x.new_zeros(time + 1, batch, hidden)
+        outputs, cells = x.new_empty(time + 1, batch, hidden), x.new_empty(time + 1, batch, hidden)
+        outputs[0], cells[0] = first_output, first_cell
         gates = x.new_empty(time, batch, 4 * hidden)
         squashed = x.new_empty(time, batch, hidden)
         for t in range(time):
             torch.addmm(projected, x[t], weight_state.t(), out=gates[t])
-            if t > 0:
-                gates[t].addmm_(outputs[t], weight_hidden.t())
+            gates[t].addmm_(outputs[t], weight_hidden.t())
             enter, forget, new, leave = gates[t].chunk(4, dim=1)
             gates[t, :, : 2 * hidden].sigmoid_()
             new.tanh_()
@@ -114,14 +127,16 @@ class _LstmSequence(torch.autograd.Function):
             torch.tanh(cells[t + 1], out=squashed[t])
             torch.mul(leave, squashed[t], out=outputs[t + 1])
         ctx.save_for_backward(x, weight_state, weight_hidden, outputs, cells, gates, squashed)
-        return outputs[1:].transpose(0, 1)
+        last_cell = cells[-1].clone()
+        ctx.mark_non_differentiable(last_cell)
+        return outputs[1:].transpose(0, 1), last_cell
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         x, weight_state, weight_hidden, outputs, cells, gates, squashed = ctx.saved_tensors
         time, batch, width = gates.shape
         sigmoid_back, tanh_back = torch.ops.aten.sigmoid_backward, torch.ops.aten.tanh_backward
-        grad = grad.transpose(0, 1)
+        grad = grads[0].transpose(0, 1)
         grad_gates = torch.empty_like(gates)
         grad_output = torch.zeros_like(outputs[0])
         grad_cell = torch.zeros_like(outputs[0])
@@ -138,10 +153,10 @@ class _LstmSequence(torch.autograd.Function):
             if t > 0:
                 grad_output = grad_gates[t] @ weight_hidden
         flat = grad_gates.view(time * batch, width)
-        grad_hidden = flat[batch:].t() @ outputs[1:time].reshape((time - 1) * batch, -1)
+        grad_hidden = flat.t() @ outputs[:time].reshape(time * batch, -1)
         grad_state = flat.t() @ x.reshape(time * batch, -1)
         grad_x = (grad_gates @ weight_state).transpose(0, 1) if ctx.needs_input_grad[0] else None
-        return grad_x, grad_gates.sum(0), grad_state, grad_hidden
+        return grad_x, grad_gates.sum(0), grad_state, grad_hidden, None, None
 
 
 class LstmPredictor(EffectPredictor):
@@ -176,35 +191,36 @@ class LstmPredictor(EffectPredictor):
         states: Float[Tensor, "batch time state"],
         lengths: Int[Tensor, " batch"],
     ) -> Float[Tensor, ""]:
-        """Mean squared error of every step's n predicted states, over all windows of the trajectories.
+        """Mean squared error of every step's n predicted states, window by window, given recorded states.
 
-        The LSTM sees recorded states; all windows of a trajectory share the projection of its features.
+        The memory that a window leaves is where the next one starts, as in a roll-out: an LSTM that started
+        anew in the middle of a trajectory could not tell how long an object at rest has been at rest.
         """
         batch, time, size = states.shape
-        ahead, window = self._config.steps_ahead, min(self._config.window, time - 1)
-        starts = torch.arange(0, time - 1, self._config.stride, device=states.device)
-        steps = starts[:, None] + torch.arange(window, device=states.device)  # (windows, window)
-        predicted = steps[..., None] + torch.arange(1, ahead + 1, device=states.device)
-        padded = F.pad(states, (0, 0, 0, window + ahead))
-        projected = self.lstm.project(features).repeat_interleave(len(starts), dim=0)
-        outputs = self.output(self.lstm(padded[:, steps].flatten(0, 1), projected))
-        errors = outputs.view(batch, *predicted.shape, size) - padded[:, predicted]
-        valid = predicted < lengths[:, None, None, None]
-        return (errors.square().mean(-1) * valid).sum() / valid.sum()
+        ahead = self._config.steps_ahead
+        projected = self.lstm.project(features)
+        memory, outputs = None, []
+        for window in states[:, :-1].split(self._config.window, dim=1):
+            output, memory = self.lstm(window, projected, memory)
+            outputs.append(output)
+        predicted = self.output(torch.cat(outputs, dim=1)).view(batch, time - 1, ahead, size)
+        targets = F.pad(states[:, 1:], (0, 0, 0, ahead - 1)).unfold(1, ahead, 1).transpose(2, 3)
+        steps = torch.arange(1, time, device=states.device)[:, None]
+        steps = steps + torch.arange(ahead, device=states.device)  # (time - 1, ahead)
+        valid = steps < lengths[:, None, None]
+        return ((predicted - targets).square().mean(-1) * valid).sum() / valid.sum()
 
     def roll_out(
         self, features: Float[Tensor, "batch features"], first: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch time state"]:
         """Feed predictions back, n states per iteration, until the trajectory is whole."""
         projected = self.lstm.project(features)
-        states = [first]
-        memory, num_read = None, 0
+        states, new = [first], [first]
+        memory = None
         while len(states) < self.num_samples:
-            if self._config.memory == "window":
-                memory, num_read = None, max(0, len(states) - self._config.window)
-            for state in states[num_read:]:
+            for state in new:
                 memory = self.lstm.step(state, projected, memory)
-            num_read = len(states)
             assert memory is not None
-            states += self.output(memory[0]).view(len(first), self._config.steps_ahead, -1).unbind(1)
+            new = self.output(memory[0]).view(len(first), self._config.steps_ahead, -1).unbind(1)
+            states += new
         return torch.stack(states[: self.num_samples], dim=1)

@@ -30,12 +30,15 @@ SPLIT = "split.json"
 RESUME = "resume.safetensors"
 TENSORBOARD = "tensorboard"
 
+Row = dict[str, int | float]
+"""The metrics of one epoch, by name."""
+
 
 @dataclass(frozen=True)
 class Progress:
     """How far a training has come."""
 
-    history: list[dict[str, float]] = field(default_factory=list)
+    history: list[Row] = field(default_factory=list)
     """One row of metrics per finished epoch."""
     best_epoch: int = 0
     """The epoch whose model is kept, counted from 1; 0 before there is one."""
@@ -50,7 +53,7 @@ class Progress:
         """The smallest validation loss so far."""
         return self.history[self.best_epoch - 1]["validation_loss"] if self.best_epoch else float("inf")
 
-    def with_epoch(self, row: dict[str, float]) -> "Progress":
+    def with_epoch(self, row: Row) -> "Progress":
         """The progress after another epoch, which is the best if its validation loss is the smallest."""
         better = row["validation_loss"] < self.best_loss
         return replace(
@@ -148,9 +151,14 @@ class RunFolder:
         except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
             raise TrainingError(f"{file} cannot be read ({error}): train anew without resuming") from error
         load_tensors(predictor, _below("model.", tensors), file)
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in _below("optimizer.", tensors).items():
             index, key = name.split(".")
+            parameter = parameters[int(index)]
+            if tensor.shape == parameter.shape:
+                # The fused optimiser pairs numbers by their place in memory: give them the parameter's layout.
+                tensor = torch.empty_like(parameter).detach().copy_(tensor)
             state.setdefault(int(index), {})[key] = tensor
         optimizer.load_state_dict(optimizer.state_dict() | {"state": state})
         return progress

@@ -22,7 +22,7 @@ from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
-from foretrace.predictor.run_folder import TENSORBOARD, Progress, RunFolder, fingerprint
+from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
 from foretrace.predictor.states import (
     StateKind,
     encode_states,
@@ -48,11 +48,7 @@ class TrainConfig:
     hidden: int = 256
     """LSTM units."""
     window: int = 15
-    """States that one training sequence shows."""
-    stride: int = 15
-    """Samples between the starts of neighbouring training sequences of one trajectory."""
-    memory: Literal["carried", "window"] = "carried"
-    """Whether a roll-out carries the LSTM's memory on, or reads the last ``window`` states anew each time."""
+    """States per training sequence; the LSTM's memory is carried on to the next one."""
     epochs: int = 100
     """Passes over the training part, at most."""
     batch_size: int = 32
@@ -77,7 +73,7 @@ class TrainConfig:
     """Threads of PyTorch on the CPU; None leaves its choice. More than the idle cores make it slower."""
 
     def __post_init__(self) -> None:
-        for name in ("steps_ahead", "hidden", "window", "stride", "epochs", "batch_size"):
+        for name in ("steps_ahead", "hidden", "window", "epochs", "batch_size"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -86,9 +82,7 @@ class TrainConfig:
     def make_predictor(self, num_samples: int) -> EffectPredictor:
         """The untrained predictor that these settings ask for."""
         features = make_features(self.features, **self.feature_options)
-        settings = LstmConfig(
-            self.state, self.steps_ahead, self.hidden, self.window, self.stride, self.memory
-        )
+        settings = LstmConfig(self.state, self.steps_ahead, self.hidden, self.window)
         return LstmPredictor(features, num_samples, settings)
 
 
@@ -239,7 +233,7 @@ class _Training:
             )
         return mean
 
-    def _validate(self, fixed: Tensor | None) -> dict[str, float]:
+    def _validate(self, fixed: Tensor | None) -> Row:
         """Errors of the whole roll-out from the first state alone."""
         part, predictor = self.validation, self.predictor
         features = self._features_of(part) if fixed is None else fixed
@@ -318,13 +312,13 @@ def _thread_count(threads: int | None) -> Iterator[None]:
 
 
 @contextmanager
-def _tensorboard(path: Path, epoch: int) -> Iterator[Callable[[dict[str, float]], None]]:
+def _tensorboard(path: Path, epoch: int) -> Iterator[Callable[[Row], None]]:
     """A function that logs a row of metrics for TensorBoard."""
     from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
     with SummaryWriter(str(path), purge_step=epoch + 1) as writer:
 
-        def log(row: dict[str, float]) -> None:
+        def log(row: Row) -> None:
             for name, value in row.items():
                 writer.add_scalar(name, value, int(row["epoch"]))
             writer.flush()

@@ -1,0 +1,140 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from factories import fake_batch
+from foretrace.errors import CheckpointError
+from foretrace.features import FEATURES, make_features
+from foretrace.predictor import LstmConfig, LstmPredictor, load_predictor, save_checkpoint
+
+
+@pytest.fixture(scope="module")
+def batch():
+    torch.set_num_threads(1)
+    return fake_batch(np.random.default_rng(5), 4, num_samples=10)
+
+
+def make(features: str = "none", **settings) -> LstmPredictor:
+    torch.manual_seed(2)
+    predictor = LstmPredictor(make_features(features), 10, LstmConfig(**({"hidden": 8} | settings)))
+    predictor.set_normalisation(
+        np.full(len(predictor.state_mean), 0.1), np.full(len(predictor.state_mean), 0.5), 0.05 * np.arange(10)
+    )
+    return predictor.eval()
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save_checkpoint(tmp_path, make())
+    return tmp_path
+
+
+def edit_config(path, **changes):
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps(config | changes))
+
+
+def edit_tensors(path, change):
+    tensors = load_file(path / "model.safetensors")
+    change(tensors)
+    save_file(tensors, path / "model.safetensors")
+
+
+@pytest.mark.parametrize("features", list(FEATURES))
+@pytest.mark.parametrize("state", ["position", "pose"])
+def test_saved_and_loaded_imagines_the_same(tmp_path, batch, features, state):
+    predictor = make(features, state=state, steps_ahead=2, window=4)
+    save_checkpoint(tmp_path / "new" / "folder", predictor)
+    loaded = load_predictor(tmp_path / "new" / "folder")
+    expected, found = predictor.imagine_batch(batch), loaded.imagine_batch(batch)
+    np.testing.assert_array_equal(found.com, expected.com)
+    np.testing.assert_array_equal(found.times, expected.times)
+    if state == "pose":
+        np.testing.assert_array_equal(found.pose, expected.pose)
+    assert loaded.config == predictor.config
+    assert loaded.features.options == predictor.features.options
+    assert not loaded.training
+
+
+def test_options_of_features_survive(tmp_path):
+    predictor = LstmPredictor(make_features("im-cnn", channel="height", width=7), 10, LstmConfig(hidden=8))
+    save_checkpoint(tmp_path, predictor)
+    loaded = load_predictor(tmp_path)
+    assert loaded.features.options == {"channel": "height", "width": 7, "dropout": 0.2}
+
+
+def test_a_folder_holds_no_pickle(saved):
+    assert sorted(file.name for file in saved.iterdir()) == ["config.json", "model.safetensors"]
+    load_file(saved / "model.safetensors")
+
+
+def test_loading_leaves_the_random_numbers_alone(saved):
+    before = torch.random.get_rng_state()
+    load_predictor(saved)
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_missing_files_are_named(saved, name):
+    (saved / name).unlink()
+    with pytest.raises(CheckpointError, match=f"{name} is missing"):
+        load_predictor(saved)
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_damaged_files_are_named(saved, name):
+    content = (saved / name).read_bytes()
+    (saved / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(CheckpointError, match=name):
+        load_predictor(saved)
+
+
+@pytest.mark.parametrize("version", [0, 2, None, "1"])
+def test_other_versions_are_refused(saved, version):
+    edit_config(saved, version=version)
+    with pytest.raises(CheckpointError, match=r"format version .* reads 1"):
+        load_predictor(saved)
+
+
+def test_other_formats_are_refused(saved):
+    edit_config(saved, format="something-else")
+    with pytest.raises(CheckpointError, match="foretrace-predictor"):
+        load_predictor(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"predictor": "oracle"}, "unknown predictor 'oracle'; available: lstm"),
+        ({"features": {"label": "magic", "options": {}}}, "unknown features 'magic'"),
+        ({"features": {"label": "none"}}, "incomplete"),
+        ({"settings": {"hidden": 8}}, "missing or unknown settings state, steps_ahead"),
+        ({"num_samples": "ten"}, "incomplete"),
+    ],
+)
+def test_odd_configurations_are_refused(saved, change, message):
+    edit_config(saved, **change)
+    with pytest.raises(CheckpointError, match=message):
+        load_predictor(saved)
+
+
+def test_missing_tensors_are_named(saved):
+    edit_tensors(saved, lambda tensors: tensors.pop("lstm.bias"))
+    with pytest.raises(CheckpointError, match=r"lacks the tensors lstm\.bias"):
+        load_predictor(saved)
+
+
+def test_extra_tensors_are_named(saved):
+    edit_tensors(saved, lambda tensors: tensors.update(stowaway=torch.zeros(1)))
+    with pytest.raises(CheckpointError, match="unexpected tensors stowaway"):
+        load_predictor(saved)
+
+
+@pytest.mark.parametrize("wrong", [torch.zeros(31), torch.zeros(32, dtype=torch.float64)])
+def test_misshaped_tensors_are_named(saved, wrong):
+    edit_tensors(saved, lambda tensors: tensors.update({"lstm.bias": wrong}))
+    with pytest.raises(CheckpointError, match=r"lstm\.bias is .* asks for \(32,\) torch\.float32"):
+        load_predictor(saved)

@@ -1,0 +1,363 @@
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from factories import fake_batch
+from foretrace.errors import CheckpointError, TrainingError
+from foretrace.evaluation.experiments import evaluate_predictor
+from foretrace.features import FEATURES, NoFeatures
+from foretrace.interactions.splits import Split
+from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
+from foretrace.predictor import training as training_module
+from foretrace.predictor.run_folder import RunFolder
+from foretrace.predictor.training import learning_rate
+from foretrace.trajectories import mean_distance
+
+SMALL = TrainConfig(features="none", hidden=16, epochs=3, split=None, window=6, device="cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return fake_batch(np.random.default_rng(7), 30, num_samples=20)
+
+
+def train(data, config: TrainConfig, out: Path, **more) -> Path:
+    return train_predictor(data, config, out, progress=False, **more)
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    with (run / "metrics.csv").open() as file:
+        return [
+            {name: text for name, text in row.items() if name != "seconds"} for row in csv.DictReader(file)
+        ]
+
+
+def same_tensors(one: Path, other: Path) -> bool:
+    a, b = load_file(one / "model.safetensors"), load_file(other / "model.safetensors")
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+class Interrupted(Exception):
+    pass
+
+
+def interrupt_after(monkeypatch, epochs: int, error: type[BaseException] = Interrupted) -> None:
+    """Let the training die right after it has noted so many epochs."""
+    save = RunFolder.save
+
+    def save_and_die(self, progress, *others):
+        save(self, progress, *others)
+        if progress.epoch == epochs:
+            raise error
+
+    monkeypatch.setattr(RunFolder, "save", save_and_die)
+
+
+@pytest.mark.parametrize("state", ["position", "pose"])
+@pytest.mark.parametrize("features", list(FEATURES))
+def test_a_run_leaves_what_is_needed(tmp_path, batch, features, state):
+    run = train(batch, replace(SMALL, features=features, state=state, epochs=2), tmp_path / "run")
+    names = {file.name for file in run.iterdir()}
+    assert names == {
+        *("config.json", "model.safetensors", "metrics.csv", "environment.json", "split.json", "tensorboard")
+    }
+    assert [row["epoch"] for row in rows(run)] == ["1", "2"]
+    environment = json.loads((run / "environment.json").read_text())
+    assert environment["seed"] == 0
+    assert environment["versions"]["torch"] == torch.__version__
+    imagined = load_predictor(run).imagine_batch(batch)
+    assert imagined.com.shape == batch.com.shape
+    assert np.isfinite(imagined.com).all()
+    np.testing.assert_array_equal(imagined.times, batch.times)
+
+
+def test_tensorboard_reads_the_events(tmp_path, batch):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = train(batch, SMALL, tmp_path / "run")
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    logged = [event.value for event in events.Scalars("validation_full_cm")]
+    np.testing.assert_allclose(logged, [float(row["validation_full_cm"]) for row in rows(run)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("features", ["none", "im-cnn"])
+def test_the_same_seed_trains_the_same_model(tmp_path, batch, features):
+    config = replace(SMALL, features=features, epochs=2)
+    one = train(batch, config, tmp_path / "one")
+    torch.manual_seed(99)
+    np.random.default_rng(1).random()
+    other = train(batch, config, tmp_path / "other")
+    assert same_tensors(one, other)
+    assert rows(one) == rows(other)
+    assert not same_tensors(one, train(batch, replace(config, seed=1), tmp_path / "seed"))
+
+
+def test_training_leaves_the_callers_random_numbers_and_threads_alone(tmp_path, batch):
+    before = torch.random.get_rng_state()
+    train(batch, replace(SMALL, threads=2, epochs=1), tmp_path / "run")
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.get_num_threads() == 1
+
+
+@pytest.mark.parametrize("after", [0, 2])
+@pytest.mark.parametrize("features", ["none", "im-cnn"])
+def test_a_resumed_training_ends_as_if_never_interrupted(tmp_path, batch, monkeypatch, features, after):
+    config = replace(SMALL, features=features)
+    whole = train(batch, config, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, after)
+        with pytest.raises(Interrupted):
+            train(batch, config, tmp_path / "run")
+    assert (tmp_path / "run" / "resume.safetensors").is_file()
+    resumed = train(batch, config, tmp_path / "run")
+    assert same_tensors(whole, resumed)
+    assert rows(whole) == rows(resumed)
+    assert not (resumed / "resume.safetensors").exists()
+
+
+def test_a_killed_process_can_go_on(tmp_path, batch):
+    """The real thing: kill -9 in the middle, then the same call."""
+    script = textwrap.dedent("""
+        import sys
+        import numpy as np, torch
+        from factories import fake_batch
+        from foretrace.predictor import TrainConfig, train_predictor
+        torch.set_num_threads(1)
+        config = TrainConfig("none", hidden=16, epochs=60, split=None, window=6, device="cpu")
+        train_predictor(fake_batch(np.random.default_rng(7), 30, num_samples=20), config, sys.argv[1], progress=False)
+    """)
+    tests = Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": f"{tests}{os.pathsep}{tests.parent / 'src'}"}
+    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "run")], env=environment)
+    metrics = tmp_path / "run" / "metrics.csv"
+    while not metrics.is_file() and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert 0 < len(rows(tmp_path / "run")) < 60
+    config = replace(SMALL, epochs=60)
+    resumed = train(batch, config, tmp_path / "run")
+    assert same_tensors(train(batch, config, tmp_path / "whole"), resumed)
+
+
+def test_after_ctrl_c_the_best_so_far_can_be_used(tmp_path, batch, monkeypatch):
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 2, KeyboardInterrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(batch, SMALL, tmp_path / "run")
+    assert load_predictor(tmp_path / "run").imagine_batch(batch).com.shape == batch.com.shape
+
+
+def test_a_finished_training_is_not_repeated(tmp_path, batch):
+    run = train(batch, SMALL, tmp_path / "run")
+    before = (run / "model.safetensors").stat().st_mtime_ns
+    assert train(batch, SMALL, run) == run
+    assert (run / "model.safetensors").stat().st_mtime_ns == before
+    train(batch, SMALL, run, resume=False)
+    assert (run / "model.safetensors").stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"hidden": 17}, "settings.hidden"),
+        ({"learning_rate": 2e-3}, r"training.learning_rate = 0.001, not 0.002"),
+    ],
+)
+def test_a_folder_of_another_configuration_is_refused(tmp_path, batch, change, name):
+    run = train(batch, SMALL, tmp_path / "run")
+    with pytest.raises(TrainingError, match=name):
+        train(batch, replace(SMALL, **change), run)
+    train(batch, replace(SMALL, **change), run, resume=False)
+
+
+def test_a_folder_of_other_data_is_refused(tmp_path, batch):
+    run = train(batch, SMALL, tmp_path / "run")
+    with pytest.raises(TrainingError, match=r"training\.data"):
+        train(batch[:20], SMALL, run)
+
+
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_folder_with_something_else_is_left_alone(tmp_path, batch, resume):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(TrainingError, match="not empty"):
+        train(batch, SMALL, tmp_path, resume=resume)
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_damaged_resume_file_is_named(tmp_path, batch, monkeypatch):
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 1)
+        with pytest.raises(Interrupted):
+            train(batch, SMALL, tmp_path / "run")
+    (tmp_path / "run" / "resume.safetensors").write_bytes(b"nonsense")
+    with pytest.raises((TrainingError, CheckpointError), match=r"resume\.safetensors"):
+        train(batch, SMALL, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"features": "magic"}, "unknown features 'magic'; available: none, im-cnn"),
+        ({"split": (1400, 100, 300)}, "needs 1800"),
+        ({"outcomes": ("tumbled",)}, "tumbled; the data has: levered, slipped"),
+    ],
+)
+def test_trainings_that_cannot_start_are_refused(tmp_path, batch, change, message):
+    with pytest.raises(TrainingError, match=message):
+        train(batch, replace(SMALL, **change), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("change", [{"epochs": 0}, {"window": 0}, {"learning_rate": 0.0}])
+def test_absurd_settings_are_refused(change):
+    with pytest.raises(TrainingError, match=next(iter(change))):
+        replace(SMALL, **change)
+
+
+def test_a_missing_cuda_device_is_refused(tmp_path, batch, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(TrainingError, match="cuda"):
+        train(batch, replace(SMALL, device="cuda"), tmp_path / "run")
+
+
+def test_a_diverging_training_is_stopped(tmp_path, batch):
+    with pytest.raises(TrainingError, match=r"loss is (nan|inf)"):
+        train(batch, replace(SMALL, learning_rate=1e30), tmp_path / "run")
+
+
+def test_only_the_chosen_outcomes_are_split(tmp_path, batch):
+    run = train(batch, replace(SMALL, epochs=1), tmp_path / "run")
+    parts = [part_of(run, batch, name) for name in ("train", "validation", "test")]
+    assert all((part.outcome == "levered").all() for part in parts)
+    ids = np.concatenate([part.ids for part in parts])
+    assert len(np.unique(ids)) == len(ids) == (batch.outcome == "levered").sum()
+    with pytest.raises(TrainingError, match="'tset'"):
+        part_of(run, batch, "tset")
+    with pytest.raises(TrainingError, match="give the data set"):
+        part_of(run, batch[:5], "train")
+
+
+def test_normalisation_and_fit_see_the_training_part_alone(tmp_path, batch, monkeypatch):
+    seen = {}
+
+    class Fitted(NoFeatures):
+        label = "fitted"
+
+        def fit(self, train, validation, *, seed, report):
+            seen.update(
+                train=train.batch.ids, validation=validation.batch.ids, rows=len(train.inputs), seed=seed
+            )
+
+    monkeypatch.setitem(FEATURES, "fitted", Fitted)
+    split = Split(np.arange(0, 10), np.arange(10, 15), np.arange(15, 20))
+    config = replace(SMALL, features="fitted", epochs=1, seed=5)
+    tensors = load_file(train(batch, config, tmp_path / "one", split=split) / "model.safetensors")
+    assert seen["train"].tolist() == list(range(10))
+    assert seen["validation"].tolist() == list(range(10, 15))
+    assert (seen["rows"], seen["seed"]) == (10, 5)
+
+    other = fake_batch(np.random.default_rng(7), 30, num_samples=20)
+    other.com[10:] += 0.5
+    moved = load_file(train(other, config, tmp_path / "two", split=split) / "model.safetensors")
+    assert torch.equal(tensors["state_mean"], moved["state_mean"])
+    assert torch.equal(tensors["state_scale"], moved["state_scale"])
+    kept = np.concatenate([batch.com[k, : min(batch.length[k], batch.slip_index[k])] for k in range(10)])
+    np.testing.assert_allclose(tensors["state_mean"], kept.mean(axis=0), rtol=1e-5)
+
+
+def test_the_best_validation_epoch_is_kept(tmp_path, batch, monkeypatch):
+    losses = iter([3.0, 1.0, 2.0])
+    kept = []
+    validate = training_module._Training._validate
+
+    def scripted(self, fixed):
+        kept.append({name: tensor.clone() for name, tensor in self.predictor.state_dict().items()})
+        return validate(self, fixed) | {"validation_loss": next(losses)}
+
+    monkeypatch.setattr(training_module._Training, "_validate", scripted)
+    tensors = load_file(train(batch, SMALL, tmp_path / "run") / "model.safetensors")
+    assert torch.equal(tensors["output.weight"], kept[1]["output.weight"])
+    assert not torch.equal(tensors["output.weight"], kept[2]["output.weight"])
+
+
+def test_the_learning_rate_falls_on_plateaus():
+    config = replace(SMALL, learning_rate=1.0, plateau_factor=0.5, plateau_patience=2)
+    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0]) == 1.0
+    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0, 2.0]) == 0.5
+    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.0]) == 0.5
+    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0]) == 0.25
+
+
+def test_features_that_do_not_train_are_computed_once(tmp_path, batch, monkeypatch):
+    calls = []
+
+    class Counted(NoFeatures):
+        label = "counted"
+
+        def forward(self, inputs):
+            calls.append(len(inputs))
+            return inputs
+
+    monkeypatch.setitem(FEATURES, "counted", Counted)
+    train(batch, replace(SMALL, features="counted"), tmp_path / "run")
+    assert len(calls) == 2  # the training part and the validation part
+
+
+@pytest.mark.parametrize(("state", "ahead"), [("position", 1), ("pose", 1), ("position", 3)])
+def test_four_interactions_are_learned_by_heart(tmp_path, state, ahead):
+    four = fake_batch(np.random.default_rng(11), 4, num_samples=16)
+    everything = Split(np.arange(4), np.arange(4), np.arange(4))
+    options = {"width": 32, "dropout": 0.0}
+    config = TrainConfig("im-cnn", options, state, ahead, 64, epochs=80, batch_size=4, learning_rate=3e-3)
+    run = train(four, replace(config, device="cpu"), tmp_path / "run", split=everything)
+    imagined = load_predictor(run).imagine_batch(four)
+    before, after = (
+        float(rows(run)[0]["validation_full_cm"]),
+        100 * mean_distance(imagined.com, four.com).mean(),
+    )
+    assert after < 0.1 * before
+    assert after < 0.4
+
+
+def test_evaluation_rows(tmp_path, batch):
+    run = train(batch, SMALL, tmp_path / "run")
+    predictor = load_predictor(run)
+    table = evaluate_predictor(predictor, batch)
+    found = {(row["group"], row["value"], row["metric"], row["start"]): row for row in table}
+    assert len(found) == len(table)
+    assert {row["start"] for row in table} == {"observed", "estimated"}
+    whole = found["all", "", "full", "observed"]
+    assert whole["count"] == len(batch)
+    truth = np.where(
+        (np.arange(20) < np.minimum(batch.length, batch.slip_index)[:, None])[..., None], batch.com, np.nan
+    )
+    errors = 100 * mean_distance(predictor.imagine_batch(batch).com, truth)
+    assert whole["mean_cm"] == pytest.approx(errors.mean())
+    assert whole["median_cm"] == pytest.approx(np.median(errors))
+    assert whole["p95_cm"] == pytest.approx(np.percentile(errors, 95))
+    slipped = found["outcome", "slipped", "full", "observed"]
+    assert slipped["mean_cm"] == pytest.approx(errors[batch.outcome == "slipped"].mean())
+    corners = [
+        row["count"]
+        for row in table
+        if (row["group"], row["metric"], row["start"]) == ("corners", "final", "observed")
+    ]
+    assert sum(corners) == len(batch)
