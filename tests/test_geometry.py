@@ -174,3 +174,28 @@ def test_continuous_quaternions_never_jump(seed):
     assert np.linalg.norm(np.diff(smooth, axis=0), axis=1).max() < 0.1
     np.testing.assert_allclose(np.abs((smooth * quaternions).sum(axis=1)), 1.0)
     np.testing.assert_array_equal(smooth[0], quaternions[0])
+
+
+def test_support_edge_of_a_square():
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    centre = np.array([0.5, 0.5])
+    assert geometry.support_edge(square, np.array([0.5, 0.0]), centre) == (2, 3)
+    assert geometry.support_edge(square, np.array([0.0, 0.3]), centre) == (1, 2)
+    assert geometry.support_edge(square, np.array([1.0, 0.6]), centre) == (0, 3)
+
+
+@given(st.integers(0, 10_000), st.integers(3, 10))
+def test_support_edge_is_crossed_by_the_ray_and_survives_mirroring(seed, num_corners):
+    rng = np.random.default_rng(seed)
+    angles = 2 * np.pi * (np.arange(num_corners) + rng.uniform(0.1, 0.9, num_corners)) / num_corners
+    corners = np.column_stack([np.cos(angles), np.sin(angles)])
+    com = corners.mean(axis=0)
+    edge = rng.integers(num_corners)
+    lift = corners[edge] + rng.uniform(0.1, 0.9) * (corners[(edge + 1) % num_corners] - corners[edge])
+    i, j = geometry.support_edge(corners, lift, com)
+    # Where the line through lift point and centre of mass meets the edge, behind the centre of mass.
+    t, u = np.linalg.solve(np.column_stack([com - lift, corners[i] - corners[j]]), corners[i] - lift)
+    assert t > 1
+    assert -1e-9 <= u <= 1 + 1e-9
+    mirrored = geometry.support_edge(corners * [1, -1], lift * [1, -1], com * [1, -1])
+    assert mirrored == (i, j)

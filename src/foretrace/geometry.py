@@ -228,3 +228,29 @@ def continuous_quaternions(quaternions: Float[np.ndarray, "time 4"]) -> Float[np
         return quaternions
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=-1) < 0, -1.0, 1.0)
     return quaternions * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+
+
+def support_edge(
+    corners: Float[np.ndarray, "n 2"], lift: Float[np.ndarray, "2"], com: Float[np.ndarray, "2"]
+) -> tuple[int, int]:
+    """The two corners that a body turns about when it is lifted gently at one point.
+
+    Statics: with a growing vertical force at the lift point, the table's reaction moves from below the centre of
+    mass away from that point, until it leaves the footprint. There the body turns: about the edge of the
+    footprint's convex hull that the ray from lift point through centre of mass crosses.
+
+    Args:
+        corners: Corners of the footprint [m].
+        lift: Where the body is lifted [m].
+        com: Its centre of mass from above, strictly inside the hull [m].
+
+    Returns:
+        Indices of the two corners, the smaller one first.
+    """
+    hull = convex_hull(corners)
+    following = np.roll(hull, -1, axis=0)
+    ray = com - lift
+    # Counter-clockwise, the hull passes from the ray's right to its left where the ray leaves it.
+    edge = int(np.flatnonzero((cross(ray, hull - lift) < 0) & (cross(ray, following - lift) >= 0))[0])
+    ends = [int(np.linalg.norm(corners - end, axis=1).argmin()) for end in (hull[edge], following[edge])]
+    return min(ends), max(ends)

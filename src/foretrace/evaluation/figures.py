@@ -360,3 +360,39 @@ def _draw_cell(ax: Axes, interaction: Interaction) -> None:
     ax.set(xlim=(middle + 11, middle - 11), ylim=(-7, 21), aspect="equal")
     ax.axis("off")
     ax.set_title(f"{interaction.id}  {effect.outcome}", fontsize=8, color=INK, fontweight="normal", pad=2)
+
+
+def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
+    """Several lever-ups side by side, each from above and from the side, imagined beside observed.
+
+    Args:
+        scenes: What to show, by the title of its column.
+    """
+    with mpl.rc_context(STYLE):
+        fig = Figure(figsize=(3.5 * len(scenes), 7.4), dpi=DPI, layout="constrained")
+        axes = fig.subplots(2, len(scenes), squeeze=False)
+        for column, (title, scene) in enumerate(scenes.items()):
+            draw_from_above(axes[0, column], scene)
+            draw_from_the_side(axes[1, column], scene)
+            errors = [
+                f"{name}: {_mean_error(scene, path):.2f} cm" for name, path in scene.predictions.items()
+            ]
+            axes[0, column].set_title("\n".join([title, *errors]), fontsize=10)
+            axes[1, column].set_title("")
+            if column > 0:
+                axes[0, column].set_ylabel("")
+                axes[1, column].set_ylabel("")
+        handles = [
+            Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
+            for name, _, color, style, width in next(iter(scenes.values())).paths()
+        ]
+        fig.legend(handles=[*handles, _support_handle()], loc="outside lower center", ncols=4)
+    return fig
+
+
+def _mean_error(scene: Scene, path: np.ndarray) -> float:
+    """Mean distance of a path from the observed one, up to a slip [cm]; NaN where nothing was observed."""
+    if scene.com is None:
+        return float("nan")
+    end = min(len(path), len(scene.com), scene.slip_index or len(scene.com))
+    return float(CM * np.linalg.norm(path[:end] - scene.com[:end], axis=1).mean())

@@ -1,19 +1,12 @@
-"""The command line: ``foretrace simulate | doctor | show | ...``.
+"""Commands about data sets: simulate, doctor, show, describe."""
 
-A command is a function of plain arguments in `COMMANDS`; tyro makes options from its signature and help from
-its docstring. Whatever is slow to import is imported inside, so that ``foretrace --help`` answers at once.
-"""
-
-import sys
-import warnings
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import tyro
 from tyro.conf import Positional
 
-from foretrace.errors import DatasetError, ForetraceError
+from foretrace.cli.console import say
+from foretrace.errors import DatasetError
 
 
 def simulate(
@@ -49,7 +42,7 @@ def simulate(
     try:
         counts = collect(config, out, workers)
     except KeyboardInterrupt:
-        _say(f"interrupted; what is done stays in {out}, the same command goes on from there")
+        say(f"interrupted; what is done stays in {out}, the same command goes on from there")
         raise
     _print_outcomes(counts)
     print(f"data set: {out}")
@@ -108,34 +101,26 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
         print(target)
 
 
-COMMANDS: dict[str, Callable[..., int | None]] = {"simulate": simulate, "doctor": doctor, "show": show}
-"""Every command by its name."""
+def describe(path: Positional[Path], out: Path | None = None) -> None:
+    """Describe a data set: outcomes, how far objects were lifted, and what they stood on.
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status.
-
-    0: done. 1: `doctor` has something left to mend. 2: an error, printed as one line. 130: interrupted.
+    Args:
+        path: Folder of the data set.
+        out: JSON file to write the figures to.
     """
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
-        try:
-            status = tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
-                prog="foretrace",
-                description="Predict how an object will move before the robot touches it.",
-                args=arguments,
-            )
-        except ForetraceError as error:
-            _say(f"error: {' '.join(str(error).split())}")
-            return 2
-        except KeyboardInterrupt:
-            return 130
-    return status or 0
+    import json
 
+    from foretrace.evaluation.description import describe_dataset
+    from foretrace.interactions.dataset import Dataset
 
-def _say(line: Any) -> None:
-    print(f"foretrace: {line}", file=sys.stderr)
+    figures = describe_dataset(Dataset.open(path))
+    _print_outcomes(figures["outcomes"])
+    for name, value in figures.items():
+        if name != "outcomes":
+            print(f"{name.replace('_', ' '):>42} {value:10.4g}")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(figures, indent=2) + "\n")
 
 
 def _print_outcomes(counts: dict[str, int]) -> None:

@@ -1,0 +1,109 @@
+"""The whole job in a few minutes: simulate, learn, predict, compare."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from foretrace.cli.learning import print_errors, read_mask
+
+if TYPE_CHECKING:
+    from foretrace.evaluation.figures import Scene
+    from foretrace.interactions.record import Interaction
+    from foretrace.interactions.topdown import TopDownView
+    from foretrace.predictor import EffectPredictor
+
+RACKET_SCALE = 0.0005
+"""Metres per pixel of the shipped silhouette of a table-tennis racket."""
+RACKET_HEIGHT = 0.015
+"""Thickness assumed for it [m]."""
+HELD_OUT_CORNERS = (4, 6, 9)
+"""Corner counts of the new shapes in the picture."""
+
+
+def demo(
+    out: Path = Path("demo"), objects: int = 48, epochs: int = 20, workers: int | None = None, seed: int = 0
+) -> None:
+    """Simulate lever-ups, learn from them, and predict new shapes and a real object's silhouette.
+
+    Args:
+        out: Folder for data, trainings and pictures; the same command goes on where an interrupted one stopped.
+        objects: Objects to learn from; the paper has 160.
+        epochs: Passes over the training part.
+        workers: Processes that simulate; by default one for each core.
+        seed: Seed of everything.
+    """
+    from foretrace.evaluation.animation import scene_animation
+    from foretrace.evaluation.experiments import evaluate_predictor
+    from foretrace.evaluation.figures import comparison_figure, contact_sheet
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
+    from foretrace.simulation.collect import CollectConfig, collect
+
+    started = time.monotonic()
+    print(f"1. Simulating lever-ups of {objects} objects with a UR10 and a screwdriver")
+    counts = collect(CollectConfig(objects=objects, seed=seed), out / "data", workers)
+    print("   " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    dataset = Dataset.open(out / "data")
+    contact_sheet(dataset).savefig(out / "interactions.png")
+
+    predictors: dict[str, EffectPredictor] = {}
+    for label, name in (("none", "no feature"), ("im-cnn", "Im-CNN")):
+        print(f"2. Training the LSTM with {name}")
+        config = TrainConfig(features=label, epochs=epochs, split=None, seed=seed)
+        run = train_predictor(dataset, config, out / "runs" / label)
+        predictors[name] = load_predictor(run)
+        print_errors(
+            evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}: errors on the test part"
+        )
+
+    print("3. Predicting shapes and an object that were not in the data, and simulating them")
+    scenes = {f"new shape, {n} corners": _scene(predictors, *_new_shape(n, seed)) for n in HELD_OUT_CORNERS}
+    scenes["table-tennis racket"] = _scene(predictors, *_racket())
+    comparison_figure(scenes).savefig(out / "predictions.png")
+    scene_animation(scenes["new shape, 6 corners"], out / "prediction.gif")
+    print(f"Done in {time.monotonic() - started:.0f} s. Look at:")
+    for name, content in (
+        ("interactions.png", "some of the simulated lever-ups"),
+        ("predictions.png", "predicted beside simulated motion"),
+        ("prediction.gif", "one of them as an animation"),
+        ("runs/im-cnn", "the trained predictor, for foretrace predict"),
+    ):
+        print(f"  {out / name}  {content}")
+
+
+def _new_shape(num_corners: int, seed: int) -> "tuple[Interaction, TopDownView]":
+    """A lever-up of a shape drawn apart from the data set's."""
+    import numpy as np
+
+    from foretrace.actions import LeverUp
+    from foretrace.objects import sample_prism
+    from foretrace.simulation.lever_up import simulate_lever_up
+
+    rng = np.random.default_rng([seed, num_corners, 1_000_003])
+    prism = sample_prism(rng, num_corners)
+    action = LeverUp.at_edge(prism, int(rng.integers(num_corners)), float(rng.uniform(0.3, 0.7)))
+    interaction = simulate_lever_up(prism, action)
+    return interaction, interaction.view
+
+
+def _racket() -> "tuple[Interaction, TopDownView]":
+    """A lever-up of a table-tennis racket at the rim of its blade, seen as a silhouette."""
+    from foretrace.actions import LeverUp
+    from foretrace.interactions.topdown import TopDownView
+    from foretrace.objects import Prism
+    from foretrace.simulation.lever_up import simulate_lever_up
+
+    mask = read_mask(Path(__file__).parents[1] / "assets" / "racket.png")
+    racket = Prism.from_mask(mask, RACKET_SCALE, RACKET_HEIGHT)
+    action = LeverUp.nearest(racket, (0.0, 0.12))
+    view = TopDownView.from_mask(mask, RACKET_SCALE, action.contact, action.direction, RACKET_HEIGHT)
+    return simulate_lever_up(racket, action), view
+
+
+def _scene(
+    predictors: "dict[str, EffectPredictor]", interaction: "Interaction", view: "TopDownView"
+) -> "Scene":
+    from foretrace.evaluation.figures import Scene
+
+    paths = {name: predictor.imagine(view).com_trajectory for name, predictor in predictors.items()}
+    return Scene.observed(interaction, paths)

@@ -1,0 +1,312 @@
+"""Commands about predictors: train, evaluate, predict."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import Positional
+
+from foretrace.cli.console import say
+from foretrace.errors import PredictionError, ShapeError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from foretrace.actions import LeverUp
+    from foretrace.interactions.topdown import TopDownView
+    from foretrace.objects import ObjectModel
+
+
+def train(
+    data: Path,
+    out: Path,
+    features: str = "im-cnn",
+    state: Literal["position", "pose"] = "position",
+    steps_ahead: int = 1,
+    epochs: int = 100,
+    batch_size: int = 32,
+    learning_rate: float | None = None,
+    outcomes: tuple[str, ...] = ("levered",),
+    split: tuple[int, int, int] | None = None,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    threads: int | None = None,
+    fresh: bool = False,
+) -> None:
+    """Train a predictor on a data set.
+
+    The same command goes on where an interrupted one stopped.
+
+    Args:
+        data: Folder of the data set.
+        out: Folder of the training: model, settings, metrics, split, TensorBoard events.
+        features: What the predictor knows about the object; an unknown label lists the choices.
+        state: Predict the centre of mass, or the whole pose.
+        steps_ahead: States predicted per iteration (n in the paper).
+        epochs: Passes over the training part, at most.
+        batch_size: Trajectories per optimiser step.
+        learning_rate: Adam's learning rate at the start.
+        outcomes: Outcomes of the interactions to learn from.
+        split: Sizes of training, validation and test part; by default the paper's 1400 100 300, or in the same
+            proportion where the data set is smaller.
+        seed: Seed of the split, the first weights, the order and the dropout.
+        device: Where to compute.
+        threads: Threads on the CPU; more than the idle cores make it slower.
+        fresh: Discard an unfinished training in the folder instead of going on with it.
+    """
+    import dataclasses
+
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.interactions.splits import PAPER_SIZES
+    from foretrace.predictor import TrainConfig, train_predictor
+
+    dataset = Dataset.open(data).where(outcome=outcomes)
+    if split is None:
+        split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
+    config = TrainConfig(
+        features=features,
+        state=state,
+        steps_ahead=steps_ahead,
+        epochs=epochs,
+        batch_size=batch_size,
+        outcomes=outcomes,
+        split=split,
+        seed=seed,
+        device=device,
+        threads=threads,
+    )
+    if learning_rate is not None:
+        config = dataclasses.replace(config, learning_rate=learning_rate)
+    try:
+        train_predictor(dataset, config, out, resume=not fresh)
+    except KeyboardInterrupt:
+        say(f"interrupted; the best model so far is in {out}, the same command goes on from there")
+        raise
+    print(f"predictor: {out}")
+
+
+def evaluate(
+    run: Positional[Path],
+    data: Path,
+    part: Literal["train", "validation", "test"] = "test",
+    out: Path | None = None,
+) -> None:
+    """Errors of a predictor as the paper defines them: over the full trajectory and at its end, in cm.
+
+    Args:
+        run: Folder of the training.
+        data: Folder of the data set that it was trained on.
+        part: Which part of the training's split to judge by.
+        out: CSV file to write the rows to.
+    """
+    import pandas as pd
+
+    from foretrace.evaluation.experiments import evaluate_predictor
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.predictor import load_predictor, part_of
+
+    rows = evaluate_predictor(load_predictor(run), part_of(run, Dataset.open(data), part))
+    print_errors(rows, f"{run}, {part} part of {data}")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame(rows).to_csv(out, index=False, float_format="%.5f")
+        print(out)
+
+
+def predict(
+    run: Positional[Path],
+    polygon: Path | None = None,
+    image: Path | None = None,
+    scale: float | None = None,
+    mesh: Path | None = None,
+    height: float = 0.02,
+    edge: int | None = None,
+    fraction: float = 0.5,
+    contact: tuple[float, float] | None = None,
+    compare: bool = False,
+    animation: bool = True,
+    out: Path = Path("prediction"),
+) -> None:
+    """Predict the motion of an object before it is touched.
+
+    Give the object as --polygon, --image or --mesh, and the contact as --edge or --contact.
+
+    Args:
+        run: Folder of the training.
+        polygon: File with the outline's corners, one "x y" or "x,y" per line [m].
+        image: Picture of the object's silhouette, white on black; needs --scale.
+        scale: Metres per pixel of the image, or per unit of the mesh (1 by default).
+        mesh: STL or OBJ file of the object.
+        height: Height of the object [m]; a mesh has its own.
+        edge: Number of the outline's edge to lever at; edge k runs from corner k to corner k + 1.
+        fraction: How far along that edge, between 0 and 1.
+        contact: Point to lever at instead, in the object's frame [m]; snapped to the outline. An image's frame has
+            its origin at the silhouette's centroid, x to the right and y up.
+        compare: Simulate the same lever-up and show truth and error beside the prediction.
+        animation: Write an animation as well.
+        out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
+    """
+    from foretrace.evaluation.animation import scene_animation
+    from foretrace.evaluation.figures import Scene, scene_figure
+    from foretrace.predictor import load_predictor
+    from foretrace.simulation.lever_up import simulate_lever_up
+
+    predictor = load_predictor(run)
+    obj, action, view, com = _object_and_action(polygon, image, scale, mesh, height, edge, fraction, contact)
+    imagined = predictor.imagine(view, com)
+    name = f"{predictor.features.label} + LSTM"
+    paths = {name: imagined.com_trajectory}
+    truth = simulate_lever_up(obj, action) if compare else None
+    if truth is not None and len(truth.effect.times) > 0:
+        scene = Scene.observed(truth, paths)
+    else:
+        scene = Scene.imagined(obj, action, imagined.times, paths)
+    out.mkdir(parents=True, exist_ok=True)
+    _write_trajectory(out, run, obj, action, imagined, truth)
+    scene_figure(scene).savefig(out / "prediction.png")
+    if animation:
+        scene_animation(scene, out / "prediction.gif")
+    if truth is not None:
+        _print_comparison(imagined.com_trajectory, truth)
+    print("\n".join(str(file) for file in sorted(out.iterdir())))
+
+
+def read_polygon(file: Path) -> "np.ndarray":
+    """Corners (n, 2) [m] from a text file with one "x y" or "x,y" per line; ``#`` starts a comment.
+
+    Raises:
+        ShapeError: If the file is missing or is not such a table.
+    """
+    import numpy as np
+
+    try:
+        text = file.read_text(encoding="utf-8")
+        corners = np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise ShapeError(
+            f'cannot read corners from {file} ({error}): write one "x y" per line [m]'
+        ) from error
+    if corners.ndim != 2 or corners.shape[1] != 2:
+        raise ShapeError(f'{file} has {corners.shape[-1]} numbers per line: write one "x y" per line [m]')
+    return corners
+
+
+def read_mask(file: Path) -> "np.ndarray":
+    """A picture (rows, columns) in grey.
+
+    Raises:
+        ShapeError: If the file cannot be read as a picture.
+    """
+    import cv2
+
+    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise ShapeError(f"cannot read a picture from {file}: give a PNG or JPEG, white object on black")
+    return picture
+
+
+def _object_and_action(
+    polygon: Path | None,
+    image: Path | None,
+    scale: float | None,
+    mesh: Path | None,
+    height: float,
+    edge: int | None,
+    fraction: float,
+    contact: tuple[float, float] | None,
+) -> "tuple[ObjectModel, LeverUp, TopDownView, np.ndarray | None]":
+    """Object, action, view, and the centre of mass in the action frame where the geometry tells it."""
+    from foretrace.actions import LeverUp
+    from foretrace.geometry import transform_points
+    from foretrace.interactions.topdown import TopDownView
+    from foretrace.objects import MeshObject, Prism
+
+    given = [name for name, value in (("polygon", polygon), ("image", image), ("mesh", mesh)) if value]
+    if len(given) != 1:
+        raise PredictionError(
+            f"{' and '.join('--' + name for name in given) or 'no object'} given: give exactly one of "
+            "--polygon, --image, --mesh"
+        )
+    if (edge is None) == (contact is None):
+        raise PredictionError("give either --edge (with --fraction) or --contact X Y")
+    mask = None
+    if polygon is not None:
+        obj: ObjectModel = Prism(read_polygon(polygon), height)
+    elif mesh is not None:
+        obj = MeshObject.load(mesh, 1.0 if scale is None else scale)
+    else:
+        if scale is None:
+            raise PredictionError("--image needs --scale, the metres per pixel")
+        assert image is not None
+        mask = read_mask(image)
+        obj = Prism.from_mask(mask, scale, height)
+    action = LeverUp.nearest(obj, contact) if edge is None else LeverUp.at_edge(obj, edge, fraction)
+    if mask is not None and scale is not None:
+        view = TopDownView.from_mask(mask, scale, action.contact, action.direction, height)
+        return obj, action, view, None
+    com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
+    return obj, action, TopDownView.of(obj, action), com
+
+
+def _write_trajectory(out: Path, run: Path, obj: Any, action: Any, imagined: Any, truth: Any) -> None:
+    import json
+
+    import numpy as np
+    import pandas as pd
+
+    content = {
+        "predictor": str(run),
+        "frame": "action: origin at the contact point on the table top, x along the action, y left, z up",
+        "units": {"times": "s", "com_trajectory": "m"},
+        "object": obj.to_dict(),
+        "contact": action.contact.tolist(),
+        "direction": action.direction.tolist(),
+        "times": imagined.times.tolist(),
+        "com_trajectory": imagined.com_trajectory.tolist(),
+    }
+    if imagined.pose_trajectory is not None:
+        content["pose_trajectory"] = imagined.pose_trajectory.tolist()
+    if truth is not None:
+        content["simulated"] = {
+            "outcome": str(truth.effect.outcome),
+            "slip_index": truth.effect.slip_index,
+            "com_trajectory": truth.effect.com_trajectory.tolist(),
+        }
+    (out / "trajectory.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    table = np.column_stack([imagined.times, imagined.com_trajectory])
+    pd.DataFrame(table, columns=["time_s", "x_m", "y_m", "z_m"]).to_csv(out / "trajectory.csv", index=False)
+
+
+def _print_comparison(imagined: "np.ndarray", truth: Any) -> None:
+    from foretrace.trajectories import final_distance, mean_distance
+
+    effect = truth.effect
+    print(f"simulated outcome: {effect.outcome}")
+    end = len(effect.com_trajectory) if effect.slip_index is None else effect.slip_index
+    end = min(end, len(imagined))
+    if end > 0:
+        until = "" if effect.slip_index is None else f" up to the slip at {effect.times[end - 1]:.2f} s"
+        full = 100 * float(mean_distance(imagined[:end], effect.com_trajectory[:end]))
+        final = 100 * float(final_distance(imagined[:end], effect.com_trajectory[:end]))
+        print(f"error{until}: {full:.2f} cm over the trajectory, {final:.2f} cm at its end")
+
+
+def print_errors(rows: list[dict[str, Any]], title: str) -> None:
+    """A table of the errors that start from the observed first sample, with the overall ones also from the view."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("interactions")
+    table.add_column("number", justify="right")
+    for metric in ("full", "final"):
+        for figure in ("mean", "median", "95 %"):
+            table.add_column(f"{metric} {figure} [cm]", justify="right")
+    for start, group, value in dict.fromkeys((row["start"], row["group"], row["value"]) for row in rows):
+        if start == "estimated" and group != "all":
+            continue
+        chosen = [row for row in rows if (row["start"], row["group"], row["value"]) == (start, group, value)]
+        name = {"all": "all", "outcome": value, "corners": f"{value} corners"}[group]
+        name += ", start seen in the view" if start == "estimated" else ""
+        figures = [f"{row[f'{figure}_cm']:.2f}" for row in chosen for figure in ("mean", "median", "p95")]
+        table.add_row(name, str(chosen[0]["count"]), *figures)
+    Console().print(table)

@@ -1,0 +1,60 @@
+"""What is in a data set, in a few figures."""
+
+from typing import Any
+
+import numpy as np
+
+from foretrace.geometry import quaternion_to_matrix, support_edge, tilt
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.record import Interaction, Outcome
+
+CM, MM = 100.0, 1000.0
+
+
+def describe_dataset(dataset: Dataset) -> dict[str, Any]:
+    """Outcomes, and medians over the levered interactions.
+
+    Args:
+        dataset: The interactions.
+
+    Returns:
+        ``outcomes`` (counts), ``interactions``, and for the levered ones: ``median_final_tilt_deg``,
+        ``median_final_rise_cm`` of the centre of mass, ``median_slide_mm`` of the centre of mass along the table before
+        the lift, ``largest_path_error_mm`` of the blade, ``two_support_corners`` (share of lever-ups with exactly two
+        observed support corners) and ``rule_agreement`` (share of those whose corners the closed-form rule of
+        ``geometry.support_edge`` names).
+    """
+    levered = dataset.where(outcome=str(Outcome.LEVERED))
+    rows = [_describe(levered[k]) for k in range(len(levered))]
+    figures: dict[str, Any] = {"outcomes": dataset.outcomes(), "interactions": len(dataset)}
+    if not rows:
+        return figures
+    angle, rise, slide, error, two, right = np.array(rows).T
+    return figures | {
+        "median_final_tilt_deg": float(np.median(angle)),
+        "median_final_rise_cm": float(np.median(rise)),
+        "median_slide_mm": float(np.median(slide)),
+        "largest_path_error_mm": float(error.max()),
+        "two_support_corners": float(two.mean()),
+        "rule_agreement": float(right[two > 0].mean()) if two.any() else float("nan"),
+    }
+
+
+def _describe(interaction: Interaction) -> tuple[float, float, float, float, bool, bool]:
+    effect, obj = interaction.effect, interaction.object
+    com = effect.com_trajectory
+    angle = tilt(quaternion_to_matrix(effect.pose_trajectory[:, 3:]))
+    # The lift begins where the blade tip leaves the table by more than a millimetre.
+    raised = effect.tool_trajectory[:, 2] > effect.tool_trajectory[0, 2] + 1e-3
+    slide = np.linalg.norm(com[int(raised.argmax()), :2] - com[0, :2])
+    observed = effect.support_corners
+    com_in_object = obj.mass_properties(interaction.physics.density).com[:2]
+    named = support_edge(obj.support_corners, interaction.action.contact, com_in_object)
+    return (
+        float(np.rad2deg(angle[-1])),
+        float(CM * (com[-1, 2] - com[0, 2])),
+        float(MM * slide),
+        float(MM * effect.path_error),
+        len(observed) == 2,
+        observed == named,
+    )
