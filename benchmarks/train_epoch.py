@@ -85,7 +85,7 @@ def seconds_per_step(steps: dict[str, Callable[[], None]], repeats: int) -> dict
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
     parser.add_argument("--repeats", type=int, default=8, help="steps timed of each")
     arguments = parser.parse_args()

@@ -18,6 +18,7 @@ from foretrace.predictor.states import (
     state_statistics,
     valid_samples,
 )
+from foretrace.trajectories import mean_distance
 
 
 @pytest.fixture(scope="module")
@@ -234,3 +235,20 @@ def test_statistics_share_a_scale_within_a_unit(batch):
     np.testing.assert_allclose(normalised.mean(axis=0), 0, atol=1e-9)
     np.testing.assert_allclose(np.mean(normalised[:, :3] ** 2), 1)
     np.testing.assert_allclose(np.mean(normalised[:, 3:] ** 2), 1)
+
+
+@pytest.mark.parametrize("state", ["position", "pose"])
+@pytest.mark.parametrize("ahead", [1, 2, 3, 4, 5])
+def test_every_number_of_steps_and_every_state_can_be_learned(batch, state, ahead):
+    four = batch[np.array([0, 1, 2, 3])]
+    predictor = make(four, "none", state=state, steps_ahead=ahead, hidden=32)
+    states = predictor.normalise(encode_states(four, state))
+    optimizer = torch.optim.Adam(predictor.parameters(), lr=1e-2)
+    errors = []
+    for step in range(201):
+        if step % 200 == 0:
+            errors.append(mean_distance(predictor.imagine_batch(four).com, four.com).mean())
+        optimizer.zero_grad()
+        predictor.training_loss(torch.zeros(4, 0), states, torch.full((4,), 24)).backward()
+        optimizer.step()
+    assert errors[1] < 0.25 * errors[0]

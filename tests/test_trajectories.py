@@ -8,7 +8,7 @@ from foretrace.trajectories import final_distance, mean_distance, rotation_error
 
 def test_a_shifted_trajectory_is_off_by_the_shift():
     a = np.random.default_rng(0).normal(size=(4, 10, 3))
-    b = a + [0.03, 0.0, 0.04]
+    b = a + np.array([0.03, 0.0, 0.04])
     np.testing.assert_allclose(mean_distance(a, b), 0.05)
     np.testing.assert_allclose(final_distance(a, b), 0.05)
 
