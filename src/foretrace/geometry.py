@@ -14,7 +14,9 @@ Numbers = np.ndarray | Sequence[Any]
 """What users may give for an array: an array, or lists or tuples of numbers, nested."""
 
 
-def cross(a: Float[np.ndarray, "*batch 2"], b: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch"]:
+def cross(
+    a: Float[np.ndarray, "*#batch 2"], b: Float[np.ndarray, "*#batch 2"]
+) -> Float[np.ndarray, "*#batch"]:
     """Signed area of the parallelogram that two plane vectors span."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 

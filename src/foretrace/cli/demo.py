@@ -52,9 +52,7 @@ def demo(
         config = TrainConfig(features=label, epochs=epochs, split=None, seed=seed)
         run = train_predictor(dataset, config, out / "runs" / label)
         predictors[name] = load_predictor(run)
-        print_errors(
-            evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}: errors on the test part"
-        )
+        print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
 
     print("3. Predicting shapes and an object that were not in the data, and simulating them")
     scenes = {f"new shape, {n} corners": _scene(predictors, *_new_shape(n, seed)) for n in HELD_OUT_CORNERS}

@@ -295,18 +295,18 @@ def print_errors(rows: list[dict[str, Any]], title: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
-    table.add_column("interactions")
+    table = Table(title=f"Errors in cm: {title}", title_justify="left")
+    table.add_column("interactions", no_wrap=True)
     table.add_column("number", justify="right")
     for metric in ("full", "final"):
         for figure in ("mean", "median", "95 %"):
-            table.add_column(f"{metric} {figure} [cm]", justify="right")
+            table.add_column(f"{metric}\n{figure}", justify="right")
     for start, group, value in dict.fromkeys((row["start"], row["group"], row["value"]) for row in rows):
         if start == "estimated" and group != "all":
             continue
         chosen = [row for row in rows if (row["start"], row["group"], row["value"]) == (start, group, value)]
         name = {"all": "all", "outcome": value, "corners": f"{value} corners"}[group]
-        name += ", start seen in the view" if start == "estimated" else ""
+        name += ", start from view" if start == "estimated" else ""
         figures = [f"{row[f'{figure}_cm']:.2f}" for row in chosen for figure in ("mean", "median", "p95")]
         table.add_row(name, str(chosen[0]["count"]), *figures)
     Console().print(table)

@@ -1,0 +1,188 @@
+"""The command line end to end on small data, and the built wheel."""
+
+import json
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+from PIL import Image
+
+from foretrace import cli
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("main-job") / "data"
+    command = ["simulate", "--out", str(folder), "--objects", "8", "--contacts-per-edge", "1"]
+    assert cli.main([*command, "--embodiment", "tool", "--workers", "1"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(data: Path) -> Path:
+    out = data.parent / "run"
+    command = ["train", "--data", str(data), "--out", str(out), "--epochs", "2", "--device", "cpu"]
+    assert cli.main([*command, "--threads", "1"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def polygon(data: Path) -> Path:
+    file = data.parent / "corners.txt"
+    file.write_text("# a kite\n0.09 0.0\n0.0, 0.08\n-0.07 0.0\n0.0 -0.08\n")
+    return file
+
+
+def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that a refused command prints."""
+    capsys.readouterr()
+    assert cli.main(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_evaluate_prints_and_writes_the_paper_errors(
+    run: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "errors.csv"
+    assert cli.main(["evaluate", str(run), "--data", str(data), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "median" in printed
+    assert "all, start from view" in printed
+    rows = pd.read_csv(out)
+    overall = rows[(rows["group"] == "all") & (rows["start"] == "observed")]
+    assert set(overall["metric"]) == {"full", "final"}
+    assert (overall["mean_cm"] > 0).all()
+    assert overall["count"].iloc[0] == len(json.loads((run / "split.json").read_text())["test"])
+
+
+def test_describe_writes_figures(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "figures.json"
+    assert cli.main(["describe", str(data), "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    assert figures["interactions"] == sum(figures["outcomes"].values()) == 52
+    assert 20 < figures["median_final_tilt_deg"] < 80
+
+
+def test_predict_a_polygon_and_compare(
+    run: Path, polygon: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "prediction"
+    command = ["predict", str(run), "--polygon", str(polygon), "--edge", "0", "--compare"]
+    assert cli.main([*command, "--no-animation", "--out", str(out)]) == 0
+    assert "cm over the trajectory" in capsys.readouterr().out
+    content = json.loads((out / "trajectory.json").read_text())
+    table = pd.read_csv(out / "trajectory.csv")
+    np.testing.assert_allclose(table[["x_m", "y_m", "z_m"]], content["com_trajectory"])
+    assert len(content["com_trajectory"]) == len(content["times"]) == 60
+    # The first row is the centre of mass at rest, in the action frame.
+    np.testing.assert_allclose(
+        content["com_trajectory"][0], content["simulated"]["com_trajectory"][0], atol=1e-5
+    )
+    assert Image.open(out / "prediction.png").width > 1000
+
+
+def test_predict_an_image_with_animation(run: Path, tmp_path: Path) -> None:
+    picture = np.zeros((200, 200), np.uint8)
+    cv2.rectangle(picture, (40, 60), (160, 140), 255, -1)
+    cv2.imwrite(str(tmp_path / "mask.png"), picture)
+    command = ["predict", str(run), "--image", str(tmp_path / "mask.png"), "--scale", "0.001"]
+    assert cli.main([*command, "--contact", "0", "0.05", "--out", str(tmp_path / "out")]) == 0
+    assert Image.open(tmp_path / "out" / "prediction.gif").n_frames > 20
+    assert json.loads((tmp_path / "out" / "trajectory.json").read_text())["direction"] == pytest.approx(
+        [0, -1]
+    )
+
+
+def test_predict_a_mesh(run: Path, tmp_path: Path) -> None:
+    trimesh.creation.box((0.16, 0.1, 0.03)).export(tmp_path / "box.stl")
+    command = ["predict", str(run), "--mesh", str(tmp_path / "box.stl"), "--edge", "1", "--no-animation"]
+    assert cli.main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "trajectory.csv").is_file()
+
+
+def test_wrong_input_is_one_clear_line(
+    run: Path, data: Path, polygon: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = tmp_path / "bad.txt"
+    bad.write_text("1 2 3\n4 5 6\n")
+    crossed = tmp_path / "crossed.txt"
+    crossed.write_text("0 0\n0.1 0.1\n0.1 0\n0 0.1\n")
+    shape = ["--polygon", str(polygon)]
+    cases = {
+        "no object given": ["predict", str(run), "--edge", "0"],
+        "either --edge": ["predict", str(run), *shape],
+        "choose 0 to 3": ["predict", str(run), *shape, "--edge", "4"],
+        "between 0 and 1": ["predict", str(run), *shape, "--edge", "0", "--fraction", "1.5"],
+        "3 numbers per line": ["predict", str(run), "--polygon", str(bad), "--edge", "0"],
+        "Self-intersection": ["predict", str(run), "--polygon", str(crossed), "--edge", "0"],
+        "cannot read corners": ["predict", str(run), "--polygon", str(tmp_path / "none.txt"), "--edge", "0"],
+        "needs --scale": ["predict", str(run), "--image", str(polygon), "--edge", "0"],
+        "cannot read a picture": [
+            "predict",
+            str(run),
+            "--image",
+            str(polygon),
+            "--scale",
+            "1",
+            "--edge",
+            "0",
+        ],
+        "none, im-cnn": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--features", "sift"],
+        str(tmp_path / "empty"): ["predict", str(tmp_path / "empty"), *shape, "--edge", "0"],
+        "is missing": ["evaluate", str(data), "--data", str(data)],
+    }
+    for expected, arguments in cases.items():
+        assert expected in error_of(arguments, capsys), arguments
+
+
+def test_a_finished_training_is_not_repeated(run: Path, data: Path) -> None:
+    before = (run / "model.safetensors").read_bytes()
+    command = ["train", "--data", str(data), "--out", str(run), "--epochs", "2", "--device", "cpu"]
+    assert cli.main(command) == 0
+    assert (run / "model.safetensors").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        cli.main(["demo", "--out", str(tmp_path), "--objects", "8", "--epochs", "1", "--workers", "1"]) == 0
+    )
+    printed = capsys.readouterr().out
+    for name in ("interactions.png", "predictions.png", "prediction.gif"):
+        assert (tmp_path / name).stat().st_size > 10_000
+        assert str(tmp_path / name) in printed
+
+
+@pytest.mark.slow
+def test_the_built_wheel_holds_everything(tmp_path: Path) -> None:
+    """A wheel built from the checkout runs without it, and carries its assets."""
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--wheel-dir", str(tmp_path), str(ROOT)], check=True)
+    (wheel,) = tmp_path.glob("foretrace-*.whl")
+    environment = tmp_path / "venv"
+    venv.create(environment, system_site_packages=False, with_pip=False)
+    (packages,) = environment.glob("lib/python*/site-packages")
+    # The dependencies are this environment's; only foretrace itself comes from the wheel.
+    trimesh_home = Path(trimesh.__file__).parents[1]
+    (packages / "dependencies.pth").write_text(f"{trimesh_home}\n")
+    subprocess.run(["unzip", "-q", str(wheel), "-d", str(packages)], check=True)
+    program = (
+        "import foretrace as ft, foretrace.cli.demo as d; from pathlib import Path;"
+        "print(ft.__file__); assert (Path(ft.__file__).parent / 'assets' / 'racket.png').is_file();"
+        "p = ft.Prism([[0, 0], [.1, 0], [.1, .1], [0, .1]]); a = ft.LeverUp.at_edge(p, 0);"
+        "print(ft.simulate(p, a, embodiment='tool').effect.outcome)"
+    )
+    python = environment / "bin" / "python"
+    done = subprocess.run([python, "-c", program], check=True, capture_output=True, text=True, cwd=tmp_path)
+    assert str(packages) in done.stdout
+    assert done.stdout.splitlines()[-1] in ("levered", "slipped")
