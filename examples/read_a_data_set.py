@@ -13,16 +13,17 @@ import numpy as np
 import foretrace as ft
 
 
-def tiny_data_set() -> str:
+def tiny_data_set() -> ft.Dataset:
     """Two objects, one lever-up at each edge, the blade alone: seven interactions in a few seconds."""
-    folder = tempfile.mkdtemp()
     simulation = ft.SimulationConfig(embodiment="tool")
-    ft.collect(ft.CollectConfig(objects=2, contacts_per_edge=1, simulation=simulation), folder, workers=1)
-    return folder
+    config = ft.CollectConfig(objects=2, contacts_per_edge=1, simulation=simulation)
+    with tempfile.TemporaryDirectory() as folder:
+        ft.collect(config, folder, workers=1)
+        return ft.Dataset.open(folder)  # whole, into memory
 
 
 def main() -> None:
-    dataset = ft.Dataset.open(sys.argv[1] if len(sys.argv) > 1 else tiny_data_set())
+    dataset = ft.Dataset.open(sys.argv[1]) if len(sys.argv) > 1 else tiny_data_set()
     print(f"{len(dataset)} interactions: {dataset.outcomes()}")
 
     # One value, several values, or a function of the column.
