@@ -111,7 +111,7 @@ def test_other_formats_are_refused(saved):
         ({"predictor": "oracle"}, "unknown predictor 'oracle'; available: lstm"),
         ({"features": {"label": "magic", "options": {}}}, "unknown features 'magic'"),
         ({"features": {"label": "none"}}, "incomplete"),
-        ({"settings": {"hidden": 8}}, "missing or unknown settings state, steps_ahead"),
+        ({"settings": {"hidden": 8}}, "missing or unknown settings residual, state"),
         ({"num_samples": "ten"}, "incomplete"),
     ],
 )

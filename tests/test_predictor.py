@@ -105,9 +105,10 @@ def test_a_sequence_can_be_cut_where_its_memory_is_carried_on():
     torch.testing.assert_close(gradient, expected)
 
 
+@pytest.mark.parametrize("residual", [True, False])
 @pytest.mark.parametrize("ahead", [1, 2, 3, 4, 5])
-def test_imagine_equals_a_hand_unrolled_loop(batch, ahead):
-    predictor = make(batch, steps_ahead=ahead)
+def test_imagine_equals_a_hand_unrolled_loop(batch, ahead, residual):
+    predictor = make(batch, steps_ahead=ahead, residual=residual)
     reference = reference_lstm(predictor.lstm)
     mean, scale = predictor.state_mean, predictor.state_scale
     with torch.no_grad():
@@ -116,7 +117,8 @@ def test_imagine_equals_a_hand_unrolled_loop(batch, ahead):
         while len(states) < 24:
             rows = torch.stack([torch.cat([state, features]) for state in states])
             outputs, _ = reference(rows[None])
-            states += predictor.output(outputs[0, -1]).view(ahead, 3)
+            said = predictor.output(outputs[0, -1]).view(ahead, 3)
+            states += states[-1] + 0.1 * said if residual else said
         expected = (torch.stack(states[:24]) * scale + mean).numpy()
     imagined = predictor.imagine(TopDownView(batch.mask[0], batch.height[0]), com=batch.com[0, 0])
     np.testing.assert_allclose(imagined.com_trajectory, expected, atol=1e-6)
@@ -175,8 +177,9 @@ def test_oracles_do_not_imagine_from_a_view(batch):
 
 @pytest.mark.parametrize("window", [5, 23, 60])
 @pytest.mark.parametrize("ahead", [1, 3])
-def test_the_loss_is_the_mean_over_every_steps_predictions(batch, ahead, window):
-    predictor = make(batch, "none", steps_ahead=ahead, window=window)
+@pytest.mark.parametrize("residual", [True, False])
+def test_the_loss_is_the_mean_over_every_steps_predictions(batch, ahead, window, residual):
+    predictor = make(batch, "none", steps_ahead=ahead, window=window, residual=residual)
     states = torch.from_numpy(encode_states(batch, "position")).float()
     lengths = torch.tensor([24, 24, 13, 2, 24, 7, 24, 24])
     with torch.no_grad():
@@ -184,6 +187,7 @@ def test_the_loss_is_the_mean_over_every_steps_predictions(batch, ahead, window)
         reference, errors = reference_lstm(predictor.lstm), []
         for row, length in zip(states, lengths, strict=True):
             predicted = predictor.output(reference(row[None])[0][0]).view(24, ahead, 3)
+            predicted = row[:, None] + 0.1 * predicted if residual else predicted
             for t in range(24):
                 targets = row[t + 1 : min(t + 1 + ahead, int(length))]
                 errors += (predicted[t, : len(targets)] - targets).square().mean(dim=1)

@@ -12,6 +12,9 @@ from foretrace.features import FeatureExtractor
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.states import StateKind, state_size
 
+CHANGE_SCALE = 0.1
+"""Normalised states change by about this much in one sample: the dense layer's numbers stay of unit scale."""
+
 
 @dataclass(frozen=True)
 class LstmConfig:
@@ -25,6 +28,9 @@ class LstmConfig:
     """LSTM units."""
     window: int = 15
     """States per training sequence. The LSTM's memory is carried from window to window, its gradient is not."""
+    residual: bool = True
+    """Whether the dense layer says by how much the n next states differ from the current one, instead of the
+    states themselves as in the paper."""
 
 
 class ProjectedLstm(nn.Module):
@@ -162,6 +168,10 @@ class _LstmSequence(torch.autograd.Function):
 class LstmPredictor(EffectPredictor):
     """Section 3.1: state and features into 256 LSTM units, a dense layer from there to the next n states.
 
+    One departure from the paper, which ``residual=False`` takes back: the dense layer predicts changes. Trained
+    on recorded states, a network that has to repeat the state itself learns to, first of all, and its small
+    errors drive a roll-out off long before it has learned to make use of the features.
+
     Args:
         features: What it knows about the object.
         num_samples: Samples in an imagined trajectory.
@@ -196,14 +206,14 @@ class LstmPredictor(EffectPredictor):
         The memory that a window leaves is where the next one starts, as in a roll-out: an LSTM that started
         anew in the middle of a trajectory could not tell how long an object at rest has been at rest.
         """
-        batch, time, size = states.shape
+        time = states.shape[1]
         ahead = self._config.steps_ahead
         projected = self.lstm.project(features)
         memory, outputs = None, []
         for window in states[:, :-1].split(self._config.window, dim=1):
             output, memory = self.lstm(window, projected, memory)
             outputs.append(output)
-        predicted = self.output(torch.cat(outputs, dim=1)).view(batch, time - 1, ahead, size)
+        predicted = self._next_states(torch.cat(outputs, dim=1), states[:, :-1])
         targets = F.pad(states[:, 1:], (0, 0, 0, ahead - 1)).unfold(1, ahead, 1).transpose(2, 3)
         steps = torch.arange(1, time, device=states.device)[:, None]
         steps = steps + torch.arange(ahead, device=states.device)  # (time - 1, ahead)
@@ -221,6 +231,13 @@ class LstmPredictor(EffectPredictor):
             for state in new:
                 memory = self.lstm.step(state, projected, memory)
             assert memory is not None
-            new = self.output(memory[0]).view(len(first), self._config.steps_ahead, -1).unbind(1)
+            new = self._next_states(memory[0], states[-1]).unbind(1)
             states += new
         return torch.stack(states[: self.num_samples], dim=1)
+
+    def _next_states(
+        self, outputs: Float[Tensor, "*batch hidden"], current: Float[Tensor, "*batch state"]
+    ) -> Float[Tensor, "*batch ahead state"]:
+        """The n states after the current ones, from the LSTM's outputs there."""
+        said = self.output(outputs).unflatten(-1, (self._config.steps_ahead, -1))
+        return current[..., None, :] + CHANGE_SCALE * said if self._config.residual else said

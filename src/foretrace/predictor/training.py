@@ -49,6 +49,8 @@ class TrainConfig:
     """LSTM units."""
     window: int = 15
     """States per training sequence; the LSTM's memory is carried on to the next one."""
+    residual: bool = True
+    """Whether the network predicts changes of the state, instead of states as in the paper."""
     epochs: int = 100
     """Passes over the training part, at most."""
     batch_size: int = 32
@@ -82,7 +84,7 @@ class TrainConfig:
     def make_predictor(self, num_samples: int) -> EffectPredictor:
         """The untrained predictor that these settings ask for."""
         features = make_features(self.features, **self.feature_options)
-        settings = LstmConfig(self.state, self.steps_ahead, self.hidden, self.window)
+        settings = LstmConfig(self.state, self.steps_ahead, self.hidden, self.window, self.residual)
         return LstmPredictor(features, num_samples, settings)
 
 
