@@ -1,10 +1,12 @@
 """Physics of simulated lever-ups: rest, symmetry, time step, embodiment, outcomes."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from foretrace.actions import LeverUp, ToolPath
-from foretrace.errors import SimulationError
+from foretrace.errors import ActionError, SimulationError
 from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Outcome, Physics
 from foretrace.objects import Prism, paper_objects
@@ -32,10 +34,8 @@ def some_trials() -> list[tuple[Prism, LeverUp]]:
 
 def test_an_object_out_of_reach_stays_where_it_is() -> None:
     obj = regular_prism()
-    away = LeverUp(contact=(-0.2, 0.0), direction=(1.0, 0.0))
-    effect = simulate_lever_up(
-        obj, away, SimulationConfig(embodiment="tool", path=ToolPath(insertion=0.0))
-    ).effect
+    before_the_rim = SimulationConfig(embodiment="tool", path=ToolPath(insertion=0.0, sweep=0.0))
+    effect = simulate_lever_up(obj, LeverUp.at_edge(obj, 2), before_the_rim).effect
     assert effect.outcome is Outcome.MISSED
     np.testing.assert_allclose(effect.com_trajectory, effect.com_trajectory[:1].repeat(60, 0), atol=1e-4)
 
@@ -132,18 +132,22 @@ def test_half_the_time_step_agrees() -> None:
 
 
 @pytest.mark.parametrize(
-    ("config", "message"),
+    ("settings", "message"),
     [
-        (SimulationConfig(engine="ode"), "engine 'ode' is unknown: choose one of mujoco"),
-        (SimulationConfig(embodiment="hand"), "embodiment 'hand' is unknown: choose one of arm, tool"),
-        (SimulationConfig(camera="fisheye"), "camera 'fisheye' is unknown: choose one of exact, rgbd"),
-        (SimulationConfig(timestep=0.003), r"timestep = 0\.003 s does not divide"),
+        ({"engine": "ode"}, "engine 'ode' is unknown: choose one of mujoco"),
+        ({"embodiment": "hand"}, "embodiment 'hand' is unknown: choose one of arm, tool"),
+        ({"camera": "fisheye"}, "camera 'fisheye' is unknown: choose one of exact, rgbd"),
+        ({"timestep": 0.003}, r"timestep = 0\.003 s does not divide"),
     ],
 )
-def test_unknown_settings_are_refused(config: SimulationConfig, message: str) -> None:
-    obj = regular_prism()
+def test_unknown_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(SimulationError, match=message):
-        simulate_lever_up(obj, LeverUp.at_edge(obj, 0), config)
+        SimulationConfig(**settings)
+
+
+def test_a_contact_off_the_outline_is_refused() -> None:
+    with pytest.raises(ActionError, match=r"contact \(0\.0000, 0\.0000\) m lies 86\.6 mm"):
+        simulate_lever_up(regular_prism(), LeverUp(contact=(0.0, 0.0), direction=(1.0, 0.0)))
 
 
 def test_a_thrown_object_counts_as_failed() -> None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 
 from foretrace.errors import ActionError
@@ -11,6 +12,8 @@ from foretrace.objects import ObjectModel
 
 CORNER_MARGIN = 0.001
 """A contact point snapped to the outline keeps this distance from the corners [m]."""
+CONTACT_TOLERANCE = 0.005
+"""A contact may lie this far from the outline, as when it was measured with an error [m]."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -76,6 +79,20 @@ class LeverUp:
         contacts = starts + fractions[:, None] * (stops - starts)
         edge = int(np.argmin(np.linalg.norm(contacts - point, axis=1)))
         return cls(contacts[edge], inward_normals(obj.corners)[edge])
+
+    def check_contact(self, obj: ObjectModel) -> None:
+        """Refuse an action that does not start on an object's outline.
+
+        Raises:
+            ActionError: if the contact lies more than ``CONTACT_TOLERANCE`` from it.
+        """
+        distance = shapely.distance(shapely.LinearRing(obj.corners), shapely.Point(self.contact))
+        if distance > CONTACT_TOLERANCE:
+            x, y = self.contact
+            raise ActionError(
+                f"contact ({x:.4f}, {y:.4f}) m lies {1e3 * distance:.1f} mm from the object's outline: "
+                "take LeverUp.nearest or LeverUp.at_edge"
+            )
 
     @property
     def T_action_object(self) -> Float[np.ndarray, "4 4"]:

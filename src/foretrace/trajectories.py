@@ -51,7 +51,7 @@ def rotation_error(
         b: Unit quaternions (w, x, y, z); their sign does not matter.
 
     Returns:
-        Geodesic angles in [0, pi] [rad].
+        Geodesic angles between 0 and pi [rad].
     """
     # Distances of unit quaternions keep small angles exact, where the arc cosine of a dot product would not.
     apart = np.linalg.norm(a - b, axis=-1)

@@ -4,11 +4,13 @@ A command is a function of plain arguments in `COMMANDS`; tyro makes the options
 its docstring. Whatever is slow to import is imported inside, so that ``foretrace --help`` answers at once.
 """
 
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 
 import tyro
 
+import foretrace
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
@@ -33,6 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0: done. 1: `doctor` has something left to mend. 2: an error, printed as one line. 130: interrupted.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if list(arguments) == ["--version"]:
+        print(f"foretrace {foretrace.__version__}")
+        return 0
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:

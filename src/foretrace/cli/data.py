@@ -116,7 +116,7 @@ def describe(path: Positional[Path], out: Path | None = None) -> None:
     figures = describe_dataset(Dataset.open(path))
     _print_outcomes(figures["outcomes"])
     for name, value in figures.items():
-        if name != "outcomes":
+        if name not in ("outcomes", "interactions"):
             print(f"{name.replace('_', ' '):>42} {value:10.4g}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

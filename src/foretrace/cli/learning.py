@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from foretrace.cli.console import say
-from foretrace.errors import PredictionError, ShapeError
+from foretrace.errors import ActionError, PredictionError, ShapeError, TrainingError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from foretrace.actions import LeverUp
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import ObjectModel
+
+LARGEST_SNAP = 0.02
+"""A contact point farther from the outline is a mistake, not one to move there [m]."""
 
 
 def train(
@@ -24,7 +27,7 @@ def train(
     steps_ahead: int = 1,
     epochs: int = 100,
     batch_size: int = 32,
-    learning_rate: float | None = None,
+    learning_rate: float = 1e-3,
     outcomes: tuple[str, ...] = ("levered",),
     split: tuple[int, int, int] | None = None,
     seed: int = 0,
@@ -51,14 +54,15 @@ def train(
         seed: Seed of the split, the first weights, the order and the dropout.
         device: Where to compute.
         threads: Threads on the CPU; more than the idle cores make it slower.
-        fresh: Discard an unfinished training in the folder instead of going on with it.
+        fresh: Discard the training in the folder instead of going on with it.
     """
-    import dataclasses
-
     from foretrace.interactions.dataset import Dataset
+    from foretrace.interactions.record import Outcome
     from foretrace.interactions.splits import PAPER_SIZES
     from foretrace.predictor import TrainConfig, train_predictor
 
+    if unknown := [name for name in outcomes if name not in list(Outcome)]:
+        raise TrainingError(f"outcome {unknown[0]!r} is unknown: choose from {', '.join(Outcome)}")
     dataset = Dataset.open(data).where(outcome=outcomes)
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
@@ -71,11 +75,10 @@ def train(
         outcomes=outcomes,
         split=split,
         seed=seed,
+        learning_rate=learning_rate,
         device=device,
         threads=threads,
     )
-    if learning_rate is not None:
-        config = dataclasses.replace(config, learning_rate=learning_rate)
     try:
         train_predictor(dataset, config, out, resume=not fresh)
     except KeyboardInterrupt:
@@ -118,7 +121,7 @@ def predict(
     image: Path | None = None,
     scale: float | None = None,
     mesh: Path | None = None,
-    height: float = 0.02,
+    height: float | None = None,
     edge: int | None = None,
     fraction: float = 0.5,
     contact: tuple[float, float] | None = None,
@@ -136,7 +139,7 @@ def predict(
         image: Picture of the object's silhouette, white on black; needs --scale.
         scale: Metres per pixel of the image, or per unit of the mesh (1 by default).
         mesh: STL or OBJ file of the object.
-        height: Height of the object [m]; a mesh has its own.
+        height: Height of a polygon or image's object [m], 0.02 by default; a mesh has its own.
         edge: Number of the outline's edge to lever at; edge k runs from corner k to corner k + 1.
         fraction: How far along that edge, between 0 and 1.
         contact: Point to lever at instead, in the object's frame [m]; snapped to the outline. An image's frame has
@@ -209,12 +212,14 @@ def _object_and_action(
     image: Path | None,
     scale: float | None,
     mesh: Path | None,
-    height: float,
+    height: float | None,
     edge: int | None,
     fraction: float,
     contact: tuple[float, float] | None,
 ) -> "tuple[ObjectModel, LeverUp, TopDownView, np.ndarray | None]":
     """Object, action, view, and the centre of mass in the action frame where the geometry tells it."""
+    import numpy as np
+
     from foretrace.actions import LeverUp
     from foretrace.geometry import transform_points
     from foretrace.interactions.topdown import TopDownView
@@ -228,7 +233,11 @@ def _object_and_action(
         )
     if (edge is None) == (contact is None):
         raise PredictionError("give either --edge (with --fraction) or --contact X Y")
-    mask = None
+    if scale is not None and polygon is not None:
+        raise PredictionError("--scale goes with --image and --mesh: write a polygon's corners in metres")
+    if height is not None and mesh is not None:
+        raise PredictionError("--height goes with --polygon and --image: a mesh has its own")
+    height, mask = 0.02 if height is None else height, None
     if polygon is not None:
         obj: ObjectModel = Prism(read_polygon(polygon), height)
     elif mesh is not None:
@@ -239,7 +248,16 @@ def _object_and_action(
         assert image is not None
         mask = read_mask(image)
         obj = Prism.from_mask(mask, scale, height)
-    action = LeverUp.nearest(obj, contact) if edge is None else LeverUp.at_edge(obj, edge, fraction)
+    if contact is not None:
+        action = LeverUp.nearest(obj, contact)
+        gap = float(np.linalg.norm(action.contact - contact))
+        if gap > LARGEST_SNAP:
+            raise ActionError(
+                f"contact {contact} lies {gap:.3f} m from the outline: choose a point within {LARGEST_SNAP} m of it"
+            )
+    else:
+        assert edge is not None
+        action = LeverUp.at_edge(obj, edge, fraction)
     if mask is not None and scale is not None:
         view = TopDownView.from_mask(mask, scale, action.contact, action.direction, height)
         return obj, action, view, None

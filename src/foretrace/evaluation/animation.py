@@ -26,7 +26,7 @@ AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)
 """Where the camera stands: turned from the action's direction towards its right, and raised."""
 LIGHT = np.array([-0.35, -0.55, 0.76])
 """Direction towards the light."""
-BLADE_WIDTH, BLADE_LENGTH = 0.0125, 0.045
+BLADE_WIDTH, BLADE_LENGTH = 0.0055, 0.045
 """The drawn blade [m]; a thinner shaft continues it."""
 LAST_FRAME_TIME = 1.2
 """How long an animation rests on its end before it repeats [s]."""
@@ -115,7 +115,7 @@ def faces_of(obj: ObjectModel) -> list[Float[np.ndarray, "_ 3"]]:
 
 def _tool_faces() -> list[np.ndarray]:
     """Blade and shaft as flat strips in the tip's frame, which points along the blade."""
-    half, shaft = BLADE_WIDTH / 2, BLADE_WIDTH / 3.2
+    half, shaft = BLADE_WIDTH / 2, 0.004
     blade = [[0, -half], [0, half], [-BLADE_LENGTH, half], [-BLADE_LENGTH, -half]]
     handle = [[-BLADE_LENGTH, -shaft], [-BLADE_LENGTH, shaft], [-TOOL_REACH, shaft], [-TOOL_REACH, -shaft]]
     return [np.column_stack([xy, np.zeros(4)]) for xy in np.array([blade, handle], dtype=float)]

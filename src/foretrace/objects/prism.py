@@ -318,7 +318,7 @@ def paper_objects(seed: int = 0, per_corner_count: int = 20) -> list[Prism]:
     """The paper's object set (section 4): 20 random prisms for each corner count from 3 to 10.
 
     Each object has its own random stream, so object i can be made again without the others: it is
-    ``sample_prism(np.random.default_rng([seed, i]), CORNER_COUNTS[i // per_corner_count])``.
+    ``sample_prism(np.random.default_rng([seed, i]), CORNER_COUNTS[i % len(CORNER_COUNTS)])``.
     """
-    counts = np.repeat(CORNER_COUNTS, per_corner_count).tolist()
+    counts = CORNER_COUNTS * per_corner_count
     return [sample_prism(np.random.default_rng([seed, i]), count) for i, count in enumerate(counts)]

@@ -106,7 +106,7 @@ class RunFolder:
             if found.get(name) != wanted.get(name):
                 raise TrainingError(
                     f"{self.path} holds a training with {name} = {found.get(name)!r}, not "
-                    f"{wanted.get(name)!r}: choose another folder, the same configuration, or do not resume"
+                    f"{wanted.get(name)!r}: choose another folder, the same configuration, or start afresh"
                 )
 
     def write_environment(self, facts: Mapping[str, Any]) -> None:

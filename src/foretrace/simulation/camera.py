@@ -21,7 +21,6 @@ from foretrace.objects import ObjectModel
 from foretrace.simulation.scene import build_scene
 from foretrace.simulation.tool import Tool
 
-CAMERAS = ("exact", "rgbd")
 MINIMAL_HEIGHT = 0.008
 """Points lower than this are the table's, noise included [m]."""
 
@@ -95,19 +94,6 @@ def take_rgbd(
     T[:3, :3] = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
     T[:3, 3] = config.position
     return RgbdFrame(rgb, depth, camera, T)
-
-
-def observe_view(obj: ObjectModel, action: LeverUp, camera: str, *, seed: int = 0) -> TopDownView:
-    """The top-down view by one of CAMERAS: from exact geometry, or from a rendered depth image.
-
-    Raises:
-        SimulationError: If there is no such camera, or nothing to render with.
-    """
-    if camera == "exact":
-        return TopDownView.of(obj, action)
-    if camera == "rgbd":
-        return take_rgbd(obj, action, seed=seed).view()
-    raise SimulationError(f"camera {camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
 
 
 def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import LeverUp, ToolPath
+from foretrace.errors import SimulationError
 from foretrace.geometry import quaternion_to_matrix, tilt, transform_points
 from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import TopDownView
@@ -15,6 +16,7 @@ from foretrace.objects import ObjectModel
 from foretrace.simulation.engine import Engine, Motion, make_engine
 from foretrace.simulation.tool import Tool
 
+CAMERAS = ("exact", "rgbd")
 LIFTED_TILT = np.deg2rad(3.0)
 """An object tilted by more than this counts as lifted [rad]."""
 OFF_SAMPLES = 2
@@ -48,6 +50,11 @@ class SimulationConfig:
     physics: Physics = field(default_factory=Physics)
     """Friction and density."""
 
+    def __post_init__(self) -> None:
+        make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
+        if self.camera not in CAMERAS:
+            raise SimulationError(f"camera {self.camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
+
 
 def simulate_lever_up(
     obj: ObjectModel,
@@ -70,18 +77,19 @@ def simulate_lever_up(
         The interaction; its outcome is ``failed`` and its trajectories are empty if the simulation diverged.
 
     Raises:
-        SimulationError: If engine, embodiment or camera is unknown.
-        ActionError: If the arm cannot follow the path.
+        SimulationError: If the machine cannot render the view.
+        ActionError: If the contact is not on the outline, or the arm cannot follow the path.
         ViewError: If the object does not fit in the view.
     """
+    action.check_contact(obj)
     engine = _engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
         view = TopDownView.of(obj, action)
     else:
         # Loads OpenGL, which the exact camera does without.
-        from foretrace.simulation.camera import observe_view
+        from foretrace.simulation.camera import take_rgbd
 
-        view = observe_view(obj, action, config.camera, seed=seed)
+        view = take_rgbd(obj, action, seed=seed).view()
     motion = engine.play(obj, action, config.path, config.tool, config.physics)
     return Interaction(
         object=obj,
@@ -125,7 +133,7 @@ def simulate(
 
     Raises:
         SimulationError: If engine, embodiment or camera is unknown.
-        ActionError: If the arm cannot follow the path.
+        ActionError: If the contact is not on the outline, or the arm cannot follow the path.
         ViewError: If the object does not fit in the view.
     """
     config = SimulationConfig(
