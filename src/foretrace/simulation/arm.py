@@ -4,6 +4,9 @@ Denavit-Hartenberg parameters, masses, centres of mass, joint, speed and torque 
 Robots publishes for the UR10 (CB3). The links are drawn and collide as capsules.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
 from dataclasses import dataclass
 
 import mujoco
@@ -229,8 +232,8 @@ def solve_joint_path(
     for i, T in enumerate(T_action_tip):
         q = solve_inverse_kinematics(model, T, q)
         positions[i] = q
-    velocities = np.gradient(positions, dt, axis=0, edge_order=2)
-    accelerations = np.gradient(velocities, dt, axis=0, edge_order=2)
+    velocities = np.asarray(np.gradient(positions, dt, axis=0, edge_order=2))
+    accelerations = np.asarray(np.gradient(velocities, dt, axis=0, edge_order=2))
     excess = np.abs(velocities).max(axis=0) / SPEED_LIMIT
     worst = int(excess.argmax())
     if excess[worst] > 1:

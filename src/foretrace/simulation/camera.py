@@ -1,5 +1,8 @@
 """A simulated RGB-D camera above the table, about as good as a Kinect's."""
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
 import ctypes
 import os
 import sys

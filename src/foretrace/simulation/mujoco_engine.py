@@ -4,6 +4,9 @@ The action is open loop, so every set point is known before the first step: one 
 the whole interaction in C. Contacts are read afterwards, at the recorded samples only.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -83,7 +86,7 @@ class MujocoEngine:
         mujoco.mj_getState(model, data, state, STATE)
         states, _ = rollout.rollout(model, data, initial_state=state[None], control=control.setpoints[None])
         stride = round(self.sample_period / self.timestep)
-        samples = np.vstack([state[None], states[0, stride - 1 :: stride]])
+        samples = np.vstack([state[None], np.asarray(states)[0, stride - 1 :: stride]])
         return self._observe(model, data, samples, control)
 
     def _compiled(

@@ -4,6 +4,9 @@ The scene lies in the action frame, so the tool path is the same for every objec
 placed: its contact point at the origin, the action's direction along x (paper, section 3.1).
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
 import mujoco
 import numpy as np
 

@@ -1,5 +1,8 @@
 """The flat-blade screwdriver: its dimensions, its body, and the carriage that moves it alone."""
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
 from dataclasses import dataclass
 
 import mujoco
