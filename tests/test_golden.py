@@ -13,7 +13,7 @@ from foretrace.simulation.collect import CollectConfig, simulate_trial
 from foretrace.simulation.lever_up import SimulationConfig
 
 GOLDEN = Path(__file__).parent / "golden"
-TRIALS = {"arm": (9, 60), "tool": (9, 50, 60)}
+TRIALS = {"arm": (31, 60), "tool": (31, 50, 77)}
 """Levered trials of the first eight objects, well away from a change of outcome."""
 
 
