@@ -49,7 +49,8 @@ def demo(
     predictors: dict[str, EffectPredictor] = {}
     for label, name in (("none", "no feature"), ("im-cnn", "Im-CNN")):
         print(f"2. Training the LSTM with {name}")
-        config = TrainConfig(features=label, epochs=epochs, split=None, seed=seed)
+        # One thread: two on a core that something else uses would be many times slower.
+        config = TrainConfig(features=label, epochs=epochs, split=None, seed=seed, threads=1)
         run = train_predictor(dataset, config, out / "runs" / label)
         predictors[name] = load_predictor(run)
         print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
