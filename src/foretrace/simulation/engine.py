@@ -7,12 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from foretrace.actions import LeverUp, ToolPath
-from foretrace.errors import SimulationError
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation.tool import Tool
-
-ENGINES = ("mujoco",)
 
 
 @dataclass(frozen=True)
@@ -46,22 +43,3 @@ class Engine(Protocol):
     def play(self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics) -> Motion:
         """Plays one lever-up from the moment before the blade moves until the end of the path."""
         ...
-
-
-def make_engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
-    """The engine of a name.
-
-    Args:
-        name: One of ENGINES.
-        embodiment: ``arm`` or ``tool``.
-        timestep: Time step [s].
-        sample_period: Time between recorded samples [s].
-
-    Raises:
-        SimulationError: If there is no such engine.
-    """
-    if name == "mujoco":
-        from foretrace.simulation.mujoco_engine import MujocoEngine
-
-        return MujocoEngine(embodiment, timestep, sample_period)
-    raise SimulationError(f"engine {name!r} is unknown: choose one of {', '.join(ENGINES)}")

@@ -13,10 +13,11 @@ from foretrace.geometry import quaternion_to_matrix, tilt, transform_points
 from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
-from foretrace.simulation.engine import Engine, Motion, make_engine
+from foretrace.simulation.engine import Engine, Motion
 from foretrace.simulation.tool import Tool
 
 CAMERAS = ("exact", "rgbd")
+ENGINES = ("mujoco",)
 LIFTED_TILT = np.deg2rad(3.0)
 """An object tilted by more than this counts as lifted [rad]."""
 OFF_SAMPLES = 2
@@ -27,6 +28,26 @@ CORNER_REACH = 0.004
 """A table contact belongs to a corner within this distance [m]."""
 SUPPORT_SHARE = 0.5
 """A support corner carries the object in at least this share of the lifted samples."""
+
+
+@lru_cache(maxsize=4)
+def make_engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
+    """The engine of a name.
+
+    Args:
+        name: One of ENGINES.
+        embodiment: ``arm`` or ``tool``.
+        timestep: Time step [s].
+        sample_period: Time between recorded samples [s].
+
+    Raises:
+        SimulationError: If there is no such engine.
+    """
+    if name == "mujoco":
+        from foretrace.simulation.mujoco_engine import MujocoEngine
+
+        return MujocoEngine(embodiment, timestep, sample_period)
+    raise SimulationError(f"engine {name!r} is unknown: choose one of {', '.join(ENGINES)}")
 
 
 @dataclass(frozen=True)
@@ -82,7 +103,7 @@ def simulate_lever_up(
         ViewError: If the object does not fit in the view.
     """
     action.check_contact(obj)
-    engine = _engine(config.engine, config.embodiment, config.timestep, config.sample_period)
+    engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
         view = TopDownView.of(obj, action)
     else:
@@ -231,11 +252,6 @@ def _corner_counts(
         distance = np.linalg.norm(points - t[..., None] * along, axis=-1)
         counts += (distance < CORNER_REACH).any(axis=0)
     return counts
-
-
-@lru_cache(maxsize=4)
-def _engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
-    return make_engine(name, embodiment, timestep, sample_period)
 
 
 @lru_cache(maxsize=4)
