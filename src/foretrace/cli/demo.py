@@ -59,7 +59,7 @@ def demo(
     scenes = {f"new shape, {n} corners": _scene(predictors, *_new_shape(n, seed)) for n in HELD_OUT_CORNERS}
     scenes["table-tennis racket"] = _scene(predictors, *_racket())
     comparison_figure(scenes).savefig(out / "predictions.png")
-    scene_animation(scenes["new shape, 6 corners"], out / "prediction.gif")
+    scene_animation(scenes["New shape, 6 corners"], out / "prediction.gif")
     print(f"Done in {time.monotonic() - started:.0f} s. Look at:")
     for name, content in (
         ("interactions.png", "some of the simulated lever-ups"),
@@ -71,18 +71,22 @@ def demo(
 
 
 def _new_shape(num_corners: int, seed: int) -> "tuple[Interaction, TopDownView]":
-    """A lever-up of a shape drawn apart from the data set's."""
+    """A lever-up of a shape drawn apart from the data set's; drawn again until it does not slip."""
     import numpy as np
 
     from foretrace.actions import LeverUp
+    from foretrace.interactions.record import Outcome
     from foretrace.objects import sample_prism
     from foretrace.simulation.lever_up import simulate_lever_up
 
     rng = np.random.default_rng([seed, num_corners, 1_000_003])
-    prism = sample_prism(rng, num_corners)
-    action = LeverUp.at_edge(prism, int(rng.integers(num_corners)), float(rng.uniform(0.3, 0.7)))
-    interaction = simulate_lever_up(prism, action)
-    return interaction, interaction.view
+    while True:
+        prism = sample_prism(rng, num_corners)
+        action = LeverUp.at_edge(prism, int(rng.integers(num_corners)), float(rng.uniform(0.2, 0.8)))
+        interaction = simulate_lever_up(prism, action)
+        # The predictors have learned from levered objects only.
+        if interaction.effect.outcome is Outcome.LEVERED:
+            return interaction, interaction.view
 
 
 def _racket() -> "tuple[Interaction, TopDownView]":
@@ -94,15 +98,17 @@ def _racket() -> "tuple[Interaction, TopDownView]":
 
     mask = read_mask(Path(__file__).parents[1] / "assets" / "racket.png")
     racket = Prism.from_mask(mask, RACKET_SCALE, RACKET_HEIGHT)
-    action = LeverUp.nearest(racket, (0.0, 0.12))
+    action = LeverUp.nearest(racket, (0.06, 0.09))
     view = TopDownView.from_mask(mask, RACKET_SCALE, action.contact, action.direction, RACKET_HEIGHT)
     return simulate_lever_up(racket, action), view
 
 
 def _scene(
-    predictors: "dict[str, EffectPredictor]", interaction: "Interaction", view: "TopDownView"
+    predictors: "dict[str, EffectPredictor]", title: str, interaction: "Interaction", view: "TopDownView"
 ) -> "Scene":
+    from dataclasses import replace
+
     from foretrace.evaluation.figures import Scene
 
     paths = {name: predictor.imagine(view).com_trajectory for name, predictor in predictors.items()}
-    return Scene.observed(interaction, paths)
+    return replace(Scene.observed(interaction, paths), title=title)

@@ -68,14 +68,14 @@ def frames(scene: Scene, width: int = 960, height: int = 450) -> Iterator[np.nda
     with mpl.rc_context(STYLE):
         fig = Figure(figsize=(width / 100, height / 100), dpi=100)
         canvas = FigureCanvasAgg(fig)
-        grid = fig.add_gridspec(3, 2, width_ratios=[2.1, 1.0], left=0.01, right=0.985, bottom=0.2, top=0.88)
+        grid = fig.add_gridspec(3, 2, width_ratios=[2.1, 1.0], left=0.01, right=0.985, bottom=0.22, top=0.88)
         stage = fig.add_subplot(grid[:, 0])
         first = fig.add_subplot(grid[0, 1])
         axes = [first, *(fig.add_subplot(grid[k, 1], sharex=first) for k in (1, 2))]
         figures.draw_over_time(axes, scene)
         cursors = [ax.axvline(0, color=figures.INK, linewidth=1) for ax in axes]
         fig.suptitle(scene.title, x=0.015, ha="left", fontsize=12, fontweight="bold")
-        fig.legend(handles=figures.legend_of(scene), loc="lower left", ncols=2, fontsize=8.5)
+        fig.legend(handles=figures.legend_of(scene), loc="lower left", fontsize=8.5)
         limits = _limits(scene)
         for k, time in enumerate(scene.times):
             stage.clear()

@@ -215,9 +215,8 @@ def legend_of(scene: Scene) -> list[Line2D]:
     for name, path, color, style, width in scene.paths():
         label = f"centre of mass, {name}"
         if scene.com is not None and path is not scene.com:
-            n = min(len(path), len(scene.com))
-            error = np.linalg.norm(path[:n] - scene.com[:n], axis=1) * CM
-            label += f" (off by {error.mean():.2f} cm on average, {error[-1]:.2f} cm at the end)"
+            mean, final = _errors(scene, path)
+            label += f" (mean error {mean:.2f} cm, at the end {final:.2f} cm)"
         handles.append(Line2D([], [], color=color, linestyle=style, linewidth=width, label=label))
     if scene.support_points is not None:
         handles.append(_support_handle())
@@ -374,9 +373,7 @@ def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
         for column, (title, scene) in enumerate(scenes.items()):
             draw_from_above(axes[0, column], scene)
             draw_from_the_side(axes[1, column], scene)
-            errors = [
-                f"{name}: {_mean_error(scene, path):.2f} cm" for name, path in scene.predictions.items()
-            ]
+            errors = [f"{name}: {_errors(scene, path)[0]:.2f} cm" for name, path in scene.predictions.items()]
             axes[0, column].set_title("\n".join([title, *errors]), fontsize=10)
             axes[1, column].set_title("")
             if column > 0:
@@ -390,9 +387,10 @@ def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
     return fig
 
 
-def _mean_error(scene: Scene, path: np.ndarray) -> float:
-    """Mean distance of a path from the observed one, up to a slip [cm]; NaN where nothing was observed."""
+def _errors(scene: Scene, path: np.ndarray) -> tuple[float, float]:
+    """Mean and final distance of a path from the observed one, up to a slip [cm]; NaN where nothing was observed."""
     if scene.com is None:
-        return float("nan")
+        return np.nan, np.nan
     end = min(len(path), len(scene.com), scene.slip_index or len(scene.com))
-    return float(CM * np.linalg.norm(path[:end] - scene.com[:end], axis=1).mean())
+    distance = CM * np.linalg.norm(path[:end] - scene.com[:end], axis=1)
+    return float(distance.mean()), float(distance[-1])
