@@ -56,8 +56,9 @@ def demo(
         print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
 
     print("3. Predicting shapes and an object that were not in the data, and simulating them")
-    scenes = {f"new shape, {n} corners": _scene(predictors, *_new_shape(n, seed)) for n in HELD_OUT_CORNERS}
-    scenes["table-tennis racket"] = _scene(predictors, *_racket())
+    shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}
+    shown["Table-tennis racket"] = _racket()
+    scenes = {title: _scene(predictors, title, *interaction) for title, interaction in shown.items()}
     comparison_figure(scenes).savefig(out / "predictions.png")
     scene_animation(scenes["New shape, 6 corners"], out / "prediction.gif")
     print(f"Done in {time.monotonic() - started:.0f} s. Look at:")
