@@ -31,7 +31,7 @@ PREDICTION_LINES = ("--", "-.", ":", (0, (5, 1, 1, 1)))
 OBJECT_COLOR = "#dde6f0"
 OBJECT_EDGE = "#4a6078"
 TOOL_COLOR = "#6b5b4b"
-SUPPORT_COLOR = "#0072b2"
+SUPPORT_COLOR = "#a3458f"
 OUTCOME_COLORS = {
     Outcome.LEVERED: "#009e73",
     Outcome.SLIPPED: "#e69f00",
