@@ -1,15 +1,20 @@
-"""One suite over every entry of FEATURES, and what is particular to each."""
+"""One suite over every entry of FEATURES, and what is particular to the convolutional ones."""
+
+from copy import deepcopy
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
 
-from factories import fake_batch
+from factories import QUICK_OPTIONS, fake_batch
 from foretrace.errors import TrainingError
 from foretrace.features import FEATURES, FitPart, ImageCnn, make_features
 from foretrace.features import base as base_module
 from foretrace.features.base import fast_precision
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.topdown import TopDownView
 
 every_label = pytest.mark.parametrize("label", list(FEATURES))
 
@@ -20,9 +25,16 @@ def batch():
     return fake_batch(np.random.default_rng(0), 6)
 
 
-def fitted(label: str, batch):
+def fitted(label: str):
+    """A copy of the extractor, fitted to six interactions."""
+    return deepcopy(_fitted(label))
+
+
+@cache
+def _fitted(label: str):
     torch.manual_seed(0)
-    extractor = make_features(label)
+    batch = fake_batch(np.random.default_rng(0), 6)
+    extractor = make_features(label, **QUICK_OPTIONS.get(label, {}))
     part = FitPart(extractor.inputs(batch), batch)
     extractor.fit(part, part, seed=0, report=lambda line: None)
     return extractor
@@ -30,7 +42,7 @@ def fitted(label: str, batch):
 
 @every_label
 def test_one_row_of_num_features_per_interaction(label, batch):
-    extractor = fitted(label, batch).eval()
+    extractor = fitted(label).eval()
     inputs = extractor.inputs(batch)
     assert len(inputs) == len(batch)
     assert inputs.device.type == "cpu"
@@ -48,7 +60,7 @@ def test_label_is_the_key(label):
 
 @every_label
 def test_a_batch_equals_its_singles(label, batch):
-    extractor = fitted(label, batch).eval()
+    extractor = fitted(label).eval()
     together = extractor(extractor.inputs(batch))
     alone = torch.cat([extractor(extractor.inputs(batch[k : k + 1])) for k in range(len(batch))])
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-5)
@@ -56,7 +68,7 @@ def test_a_batch_equals_its_singles(label, batch):
 
 @every_label
 def test_gradient_if_and_only_if_trainable(label, batch):
-    extractor = fitted(label, batch).train()
+    extractor = fitted(label).train()
     features = extractor(extractor.inputs(batch))
     assert features.requires_grad == extractor.trainable
     if extractor.trainable:
@@ -67,7 +79,7 @@ def test_gradient_if_and_only_if_trainable(label, batch):
 
 @every_label
 def test_preparing_inputs_learns_and_draws_nothing(label, batch):
-    extractor = fitted(label, batch)
+    extractor = fitted(label)
     before = torch.random.get_rng_state()
     first, second = extractor.inputs(batch), extractor.inputs(batch)
     assert torch.equal(first, second)
@@ -76,7 +88,7 @@ def test_preparing_inputs_learns_and_draws_nothing(label, batch):
 
 @every_label
 def test_remade_from_label_options_and_tensors(label, batch):
-    extractor = fitted(label, batch).eval()
+    extractor = fitted(label).eval()
     again = make_features(label, **extractor.options).eval()
     again.load_state_dict(extractor.state_dict())
     inputs = extractor.inputs(batch)
@@ -85,12 +97,23 @@ def test_remade_from_label_options_and_tensors(label, batch):
 
 @every_label
 def test_only_oracles_read_the_effect(label, batch):
-    extractor = fitted(label, batch).eval()
-    unseen = fake_batch(np.random.default_rng(0), 6)
+    extractor = fitted(label).eval()
+    other = fake_batch(np.random.default_rng(0), 6)
     for name in ("com", "pose", "support_points"):
-        getattr(unseen, name)[:] = np.nan
-    same = torch.equal(extractor(extractor.inputs(batch)), extractor(extractor.inputs(unseen)))
+        getattr(other, name)[:] += 0.01
+    same = torch.equal(extractor(extractor.inputs(batch)), extractor(extractor.inputs(other)))
     assert same != extractor.oracle
+
+
+@every_label
+def test_a_view_alone_has_features(label, batch):
+    extractor = fitted(label).eval()
+    views = InteractionBatch.from_views(
+        [TopDownView(m, h) for m, h in zip(batch.mask, batch.height, strict=True)]
+    )
+    features = extractor(extractor.inputs(views))
+    assert features.shape == (len(batch), extractor.num_features)
+    assert torch.isfinite(features).all()
 
 
 def test_unknown_labels_are_refused_with_the_alternatives():
@@ -106,7 +129,7 @@ def test_unknown_options_are_refused_with_the_alternatives():
 
 
 def test_the_cnn_is_the_papers_stack(batch):
-    extractor = fitted("im-cnn", batch).eval()
+    extractor = fitted("im-cnn").eval()
     shapes = [tuple(p.shape) for name, p in extractor.stack.named_parameters() if name.endswith("weight")]
     assert shapes == [(32, 1, 3, 3), (64, 32, 3, 3), (128, 64, 3, 3), (256, 128, 3, 3)]
     x = extractor.inputs(batch).float().contiguous()

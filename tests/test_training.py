@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from factories import fake_batch
+from factories import QUICK_OPTIONS, fake_batch
 from foretrace.errors import CheckpointError, TrainingError
 from foretrace.evaluation.experiments import evaluate_predictor
 from foretrace.features import FEATURES, NoFeatures
@@ -73,7 +73,9 @@ def interrupt_after(monkeypatch, epochs: int, error: type[BaseException] = Inter
 @pytest.mark.parametrize("state", ["position", "pose"])
 @pytest.mark.parametrize("features", list(FEATURES))
 def test_a_run_leaves_what_is_needed(tmp_path, batch, features, state):
-    run = train(batch, replace(SMALL, features=features, state=state, epochs=2), tmp_path / "run")
+    options = QUICK_OPTIONS.get(features, {})
+    config = replace(SMALL, features=features, feature_options=options, state=state, epochs=2)
+    run = train(batch, config, tmp_path / "run")
     names = {file.name for file in run.iterdir()}
     assert names == {
         *("config.json", "model.safetensors", "metrics.csv", "environment.json", "split.json", "tensorboard")
@@ -137,7 +139,7 @@ def test_a_killed_process_can_go_on(tmp_path, batch):
     script = textwrap.dedent("""
         import sys
         import numpy as np, torch
-        from factories import fake_batch
+        from factories import QUICK_OPTIONS, fake_batch
         from foretrace.predictor import TrainConfig, train_predictor
         torch.set_num_threads(1)
         config = TrainConfig("none", hidden=16, epochs=25, split=None, window=6, device="cpu")

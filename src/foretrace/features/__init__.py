@@ -1,11 +1,25 @@
 """What the predictor is told about an object: the paper's feature descriptors (section 3)."""
 
 from foretrace.errors import TrainingError
+from foretrace.features.autoencoder import Autoencoder256, Autoencoder512
 from foretrace.features.base import FeatureExtractor, FitPart, NoFeatures, Option, Precision, option_names
-from foretrace.features.cnn import ImageCnn
+from foretrace.features.cnn import ImageCnn, ShapeContextCnn
+from foretrace.features.shape_context import ShapeContext200, ShapeContext800, ShapeContext3200
+from foretrace.features.support_points import (
+    ObservedSupportPoints,
+    PredictedSupportPoints,
+    SupportPointsByRule,
+    support_point_accuracy,
+)
 
 FEATURES: dict[str, type[FeatureExtractor]] = {
-    extractor.label: extractor for extractor in (NoFeatures, ImageCnn)
+    extractor.label: extractor
+    for extractor in (
+        *(NoFeatures, ImageCnn, ShapeContextCnn),
+        *(ShapeContext200, ShapeContext800, ShapeContext3200),
+        *(Autoencoder256, Autoencoder512),
+        *(SupportPointsByRule, PredictedSupportPoints, ObservedSupportPoints),
+    )
 }
 """Every feature extractor by its label in the paper's figures."""
 
@@ -31,11 +45,21 @@ def make_features(label: str, **options: Option) -> FeatureExtractor:
 
 __all__ = [
     "FEATURES",
+    "Autoencoder256",
+    "Autoencoder512",
     "FeatureExtractor",
     "FitPart",
     "ImageCnn",
     "NoFeatures",
+    "ObservedSupportPoints",
     "Option",
     "Precision",
+    "PredictedSupportPoints",
+    "ShapeContext200",
+    "ShapeContext800",
+    "ShapeContext3200",
+    "ShapeContextCnn",
+    "SupportPointsByRule",
     "make_features",
+    "support_point_accuracy",
 ]

@@ -8,13 +8,16 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features.base import FeatureExtractor
+from foretrace.features.base import FeatureExtractor, Option
+from foretrace.features.shape_context import ShapeContext3200, shape_contexts
 from foretrace.interactions.dataset import InteractionBatch
 
 CHANNELS = (32, 64, 128, 256)
 """Channels of the four convolutions (paper, section 3.3)."""
 HEIGHT_SCALE = 0.1
 """Heights are divided by this to be of unit scale [m]."""
+NUM_RINGS, NUM_WEDGES = ShapeContext3200.num_rings, ShapeContext3200.num_wedges
+"""Size of the shape-context matrix that is convolved."""
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -53,11 +56,39 @@ class ConvolutionStack(nn.Module):
         return x
 
 
-class ImageCnn(FeatureExtractor):
-    """``im-cnn``: a convolutional network on the top-down view.
+class ConvolutionalFeatures(FeatureExtractor):
+    """A stack of convolutions, flattened into one dense layer of rectified units with dropout.
 
-    The paper leaves the width after the convolutions open: here the 8x8x256 map is flattened into one dense
-    layer of ``width`` rectified units with dropout.
+    The paper leaves open what comes after the convolutions.
+
+    Args:
+        num_cells: Numbers in the stack's feature maps.
+        width: Units of the dense layer.
+        dropout: Fraction of them dropped at each training step.
+        **options: All settings of the subclass.
+    """
+
+    def __init__(self, num_cells: int, width: int, dropout: float, **options: Option):
+        super().__init__(width=width, dropout=dropout, **options)
+        self.stack = ConvolutionStack()
+        self.dense = initialise_rectified(nn.Linear(num_cells, width))
+        self.dropout = nn.Dropout(dropout)
+
+    @property
+    def num_features(self) -> int:
+        """Units of the dense layer."""
+        return self.dense.out_features
+
+    def forward(self, inputs: Shaped[Tensor, "batch 1 rows columns"]) -> Float[Tensor, "batch features"]:
+        """Convolutions in ``precision`` while training, the dense layer always in float32."""
+        reduced = self.training and self.precision == "bfloat16"
+        with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=reduced):
+            maps = self.stack(inputs.float())
+        return self.dropout(F.relu(self.dense(maps.float().flatten(1))))
+
+
+class ImageCnn(ConvolutionalFeatures):
+    """``im-cnn``: a convolutional network on the top-down view, whose last maps have 8x8x256 cells.
 
     Args:
         channel: What it looks at: the object's ``mask`` or its ``height`` map.
@@ -68,16 +99,8 @@ class ImageCnn(FeatureExtractor):
     label = "im-cnn"
 
     def __init__(self, channel: Literal["mask", "height"] = "mask", width: int = 128, dropout: float = 0.2):
-        super().__init__(channel=channel, width=width, dropout=dropout)
+        super().__init__(8 * 8 * CHANNELS[-1], width, dropout, channel=channel)
         self.channel = channel
-        self.stack = ConvolutionStack()
-        self.dense = initialise_rectified(nn.Linear(8 * 8 * CHANNELS[-1], width))
-        self.dropout = nn.Dropout(dropout)
-
-    @property
-    def num_features(self) -> int:
-        """Units of the dense layer."""
-        return self.dense.out_features
 
     def inputs(self, batch: InteractionBatch) -> Shaped[Tensor, "batch 1 128 128"]:
         """The masks as bytes (0 or 1), or the height maps in units of 10 cm."""
@@ -85,9 +108,23 @@ class ImageCnn(FeatureExtractor):
             return torch.from_numpy(batch.mask).to(torch.uint8)[:, None]
         return torch.from_numpy(batch.height).float()[:, None] / HEIGHT_SCALE
 
-    def forward(self, inputs: Shaped[Tensor, "batch 1 128 128"]) -> Float[Tensor, "batch features"]:
-        """Convolutions in ``precision`` while training, the dense layer always in float32."""
-        reduced = self.training and self.precision == "bfloat16"
-        with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=reduced):
-            maps = self.stack(inputs.float())
-        return self.dropout(F.relu(self.dense(maps.float().flatten(1))))
+
+class ShapeContextCnn(ConvolutionalFeatures):
+    """``sc-cnn``: a convolutional network on the shape-context matrix of ``sc-3200``.
+
+    The paper does not say which of its matrices the network reads. This one has 40 rings x 80 wedges, so that
+    four poolings leave 2x5x256 cells; of the smaller ones they would leave one row or nothing.
+
+    Args:
+        width: Number of features.
+        dropout: Fraction of the features dropped at each training step.
+    """
+
+    label = "sc-cnn"
+
+    def __init__(self, width: int = 128, dropout: float = 0.2):
+        super().__init__((NUM_RINGS // 16) * (NUM_WEDGES // 16) * CHANNELS[-1], width, dropout)
+
+    def inputs(self, batch: InteractionBatch) -> Float[Tensor, "batch 1 40 80"]:
+        """The matrices times their wedges: a cell that the outline crosses is about 1, as in a mask."""
+        return shape_contexts(batch, NUM_RINGS, NUM_WEDGES)[:, None] * NUM_WEDGES
