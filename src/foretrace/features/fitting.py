@@ -1,0 +1,91 @@
+"""A feature extractor's own training: one loop for those that learn before the predictor does."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from foretrace.errors import TrainingError
+
+NUM_REPORTS = 10
+"""Lines on the progress, at most."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of such a training."""
+
+    epochs: int
+    """Passes over the training part, at most."""
+    batch_size: int
+    """Rows per optimiser step."""
+    learning_rate: float
+    """Adam's learning rate."""
+    patience: int
+    """Epochs without a smaller validation loss after which the training stops."""
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch_size", "patience"):
+            if getattr(self, name) < 1:
+                raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise TrainingError(f"learning_rate must be positive, not {self.learning_rate}")
+
+
+def fit_network(
+    network: nn.Module,
+    train_loss: Callable[[Int[Tensor, " rows"]], Float[Tensor, ""]],
+    validation_loss: Callable[[], float],
+    num_rows: int,
+    config: FitConfig,
+    *,
+    name: str,
+    seed: int,
+    report: Callable[[str], None],
+) -> None:
+    """Train a network, keep its best validation epoch and freeze it.
+
+    Args:
+        network: What to train; it has no dropout.
+        train_loss: Mean loss of the given rows of the training part.
+        validation_loss: Loss of the validation part; called without gradients.
+        num_rows: Rows of the training part.
+        config: Settings.
+        name: What is trained, for reports and errors.
+        seed: Seed of the order of the rows.
+        report: Takes a line on the progress.
+
+    Raises:
+        TrainingError: A loss is no longer finite.
+    """
+    network.requires_grad_(True)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+    rng = np.random.default_rng(seed)
+    best, best_epoch, kept = float("inf"), 0, {}
+    try:
+        for epoch in range(1, config.epochs + 1):
+            for rows in torch.from_numpy(rng.permutation(num_rows)).split(config.batch_size):
+                optimizer.zero_grad()
+                train_loss(rows).backward()
+                optimizer.step()
+            with torch.no_grad():
+                loss = validation_loss()
+            if not np.isfinite(loss):
+                raise TrainingError(
+                    f"{name}: the validation loss is {loss} in epoch {epoch}: lower the learning rate of "
+                    f"{config.learning_rate}"
+                )
+            if loss < best:
+                best, best_epoch = loss, epoch
+                kept = {key: tensor.clone() for key, tensor in network.state_dict().items()}
+            elif epoch - best_epoch >= config.patience:
+                break
+            if epoch % -(-config.epochs // NUM_REPORTS) == 0:
+                report(f"{name}: epoch {epoch} of {config.epochs}, best validation loss {best:.3g}")
+    finally:
+        network.requires_grad_(False)
+    network.load_state_dict(kept)
+    report(f"{name}: best validation loss {best:.3g} in epoch {best_epoch}")
