@@ -255,6 +255,9 @@ def test_only_the_chosen_outcomes_are_split(tmp_path, batch):
         part_of(run, batch, "tset")
     with pytest.raises(TrainingError, match="give the data set"):
         part_of(run, batch[:5], "train")
+    other = replace(batch, com=batch.com + 1e-6)
+    with pytest.raises(TrainingError, match="were others than those in the data"):
+        part_of(run, other, "train")
 
 
 def test_normalisation_and_fit_see_the_training_part_alone(tmp_path, batch, monkeypatch):

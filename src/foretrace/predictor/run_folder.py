@@ -114,10 +114,11 @@ class RunFolder:
         write_json(self.path / ENVIRONMENT, {**facts, "commit": _git_commit(), "versions": _versions()})
 
     def write_split(self, batch: InteractionBatch, split: Split) -> None:
-        """Note the ids of the interactions in each part."""
-        write_json(
-            self.path / SPLIT, {part: batch.ids[rows].tolist() for part, rows in asdict(split).items()}
-        )
+        """Note the ids of the interactions in each part, and what they were."""
+        parts = asdict(split).items()
+        content = {part: batch.ids[rows].tolist() for part, rows in parts}
+        prints = {part: fingerprint(batch[np.sort(rows)]) for part, rows in parts}
+        write_json(self.path / SPLIT, {**content, "fingerprints": prints})
 
     def save(self, progress: Progress, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
         """Note the end of an epoch; the model itself too if the epoch is the best so far."""
@@ -171,7 +172,7 @@ class RunFolder:
 def fingerprint(batch: InteractionBatch) -> str:
     """A short hash of everything in a batch that a training can read."""
     digest = hashlib.sha256()
-    for name in ("ids", "mask", "height", "corners", "times", "com", "pose", "length", "slip_index"):
+    for name in ("ids", "mask", "height", "times", "com", "pose", "length", "slip_index"):
         digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
     digest.update(np.ascontiguousarray(batch.support_points).tobytes())
     digest.update("\n".join(batch.outcome.tolist()).encode())
@@ -187,12 +188,13 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
         part: ``train``, ``validation`` or ``test``.
 
     Raises:
-        TrainingError: The folder tells of no such part, or the data lacks some of its interactions.
+        TrainingError: The folder tells of no such part, or the data has not the interactions that were in it.
     """
     file = Path(run) / SPLIT
     if not file.is_file():
         raise TrainingError(f"{file} is missing: {run} is not the folder of a training")
     parts = json.loads(file.read_text(encoding="utf-8"))
+    prints = parts.pop("fingerprints")
     if part not in parts:
         raise TrainingError(f"{file} has no part {part!r}; it has: {', '.join(parts)}")
     batch = data if isinstance(data, InteractionBatch) else data.batch()
@@ -200,6 +202,11 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
     if len(rows) != len(parts[part]):
         raise TrainingError(
             f"the data has {len(rows)} of the {len(parts[part])} interactions in the {part} part of {run}: "
+            "give the data set that it was trained on"
+        )
+    if fingerprint(batch[rows]) != prints[part]:
+        raise TrainingError(
+            f"the interactions in the {part} part of {run} were others than those in the data: "
             "give the data set that it was trained on"
         )
     return batch[rows]
