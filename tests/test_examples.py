@@ -6,8 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
+
+from foretrace.actions import LeverUp
+from foretrace.errors import SimulationError
+from foretrace.objects import paper_objects
+from foretrace.simulation.camera import take_rgbd
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 60
@@ -78,3 +84,14 @@ def test_tool_path_sweep() -> None:
     outcomes = [row.split("deg")[1].split()[0] for row in rows]
     assert set(outcomes) <= {"levered", "slipped", "tumbled", "rolled", "missed"}
     assert "levered" in outcomes
+
+
+def test_render_scene(tmp_path: Path) -> None:
+    obj = paper_objects(0, 1)[0]
+    try:
+        take_rgbd(obj, LeverUp.at_edge(obj, 0))
+    except SimulationError as error:
+        pytest.skip(str(error))
+    printed = run_python(EXAMPLES / "render_scene.py", tmp_path / "scene.png")
+    assert "levered, at 4 moments" in printed
+    assert np.ptp(np.asarray(Image.open(tmp_path / "scene.png"))) > 100

@@ -56,13 +56,14 @@ LINK_CAPSULES = (
     ((0.0, 0.0, 0.09), (0.0, 0.0, 0.16), 0.075),
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.18), 0.07),
     ((0.0, 0.0, 0.18), (-0.612, 0.0, 0.18), 0.058),
+    ((0.0, 0.0, 0.18), (0.0, 0.0, 0.05), 0.055),
     ((0.0, 0.0, 0.05), (-0.5723, 0.0, 0.05), 0.048),
     ((0.0, 0.0, 0.06), (0.0, 0.0, 0.163941), 0.045),
     ((0.0, 0.0, 0.03), (0.0, 0.0, 0.1157), 0.045),
     ((0.0, 0.0, 0.03), (0.0, 0.0, 0.06), 0.04),
 )
 """Ends [m] and radius [m] of the capsules, in the frames of the bodies in CAPSULE_BODIES."""
-CAPSULE_BODIES = (0, 1, 1, 2, 3, 4, 5)
+CAPSULE_BODIES = (0, 1, 1, 2, 2, 3, 4, 5)
 
 HOLDER_ANGLE = np.deg2rad(45.0)
 """The holder turns the screwdriver up from the flange's axis by this angle, to keep the wrist off the table [rad]."""
