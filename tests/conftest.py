@@ -1,6 +1,14 @@
 """Options of the test suite."""
 
+import os
+
 import pytest
+from hypothesis import settings
+
+# Continuous integration tries the same examples every time; elsewhere new ones are searched for.
+settings.register_profile("ci", derandomize=True)
+if os.environ.get("CI"):
+    settings.load_profile("ci")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
