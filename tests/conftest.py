@@ -5,10 +5,10 @@ import os
 import pytest
 from hypothesis import settings
 
-# Continuous integration tries the same examples every time; elsewhere new ones are searched for.
-settings.register_profile("ci", derandomize=True)
-if os.environ.get("CI"):
-    settings.load_profile("ci")
+# No deadline: how long an example takes says more about the machine than about the code. Continuous integration tries
+# the same examples every time; elsewhere new ones are searched for.
+settings.register_profile("foretrace", deadline=None, derandomize=bool(os.environ.get("CI")))
+settings.load_profile("foretrace")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
