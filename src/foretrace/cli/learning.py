@@ -148,6 +148,8 @@ def predict(
         animation: Write an animation as well.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
     """
+    from dataclasses import replace
+
     from foretrace.evaluation.animation import scene_animation
     from foretrace.evaluation.figures import Scene, scene_figure
     from foretrace.predictor import load_predictor
@@ -160,7 +162,8 @@ def predict(
     paths = {name: imagined.com_trajectory}
     truth = simulate_lever_up(obj, action) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
-        scene = Scene.observed(truth, paths)
+        title = f"Predicted and simulated lever-up: {truth.effect.outcome}"
+        scene = replace(Scene.observed(truth, paths), title=title)
     else:
         scene = Scene.imagined(obj, action, imagined.times, paths)
     out.mkdir(parents=True, exist_ok=True)
