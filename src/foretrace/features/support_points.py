@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -80,23 +80,19 @@ def points_of(features: Float[Tensor, "batch 4"]) -> Float[np.ndarray, "batch 2 
     return UNIT * features.detach().double().cpu().numpy().reshape(-1, 2, 2)
 
 
-def support_point_accuracy(
+def named_right(
     predicted: Float[np.ndarray, "batch 2 2"],
     corners: Float[np.ndarray, "batch corners 2"],
     observed: Float[np.ndarray, "batch 2 2"],
-) -> float:
-    """Share of the interactions of which both support corners are right (paper, section 5.1).
+) -> Bool[np.ndarray, " batch"]:
+    """Where both support corners are right; False where none were observed.
 
-    Each point stands for the corner of the outline that is nearest to it; the order of the two does not
-    matter. Interactions without observed support points are left out.
+    Each point stands for the corner of the outline that is nearest to it; the order of the two does not matter.
 
     Args:
         predicted: Support points in the action frame [m].
         corners: Corners of the outlines [m], NaN-padded.
         observed: What was observed [m]; NaN where nothing was.
-
-    Returns:
-        Between 0 and 1; NaN where nothing was observed at all.
     """
 
     def nearest(points: np.ndarray) -> np.ndarray:
@@ -104,8 +100,23 @@ def support_point_accuracy(
         return np.sort(np.where(np.isnan(distance), np.inf, distance).argmin(axis=-1), axis=-1)
 
     seen = np.isfinite(observed).all(axis=(1, 2))
-    right = (nearest(predicted) == nearest(observed)).all(axis=-1)
-    return float(right[seen].mean()) if seen.any() else float("nan")
+    return seen & (nearest(predicted) == nearest(observed)).all(axis=-1)
+
+
+def support_point_accuracy(
+    predicted: Float[np.ndarray, "batch 2 2"],
+    corners: Float[np.ndarray, "batch corners 2"],
+    observed: Float[np.ndarray, "batch 2 2"],
+) -> float:
+    """Share of the interactions of which both support corners are right (paper, section 5.1).
+
+    See `named_right`. Interactions without observed support points are left out.
+
+    Returns:
+        Between 0 and 1; NaN where nothing was observed at all.
+    """
+    seen = np.isfinite(observed).all(axis=(1, 2))
+    return float(named_right(predicted, corners, observed)[seen].mean()) if seen.any() else float("nan")
 
 
 # --- features ---------------------------------------------------------------------------------------------
