@@ -38,3 +38,7 @@ class CheckpointError(ForetraceError):
 
 class PredictionError(ForetraceError):
     """An input that the predictor cannot imagine an effect for."""
+
+
+class ResultsError(ForetraceError):
+    """Results that are missing, damaged or of another version, data set or recipe; an experiment that is unknown."""
