@@ -14,6 +14,7 @@ import foretrace
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
+from foretrace.cli.figures import figures
 from foretrace.cli.learning import evaluate, predict, train
 from foretrace.errors import ForetraceError
 
@@ -22,6 +23,7 @@ COMMANDS: dict[str, Callable[..., int | None]] = {
     "simulate": simulate,
     "train": train,
     "evaluate": evaluate,
+    "figures": figures,
     "predict": predict,
     "show": show,
     "describe": describe,
