@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/installed
 
-.PHONY: setup demo test check bench docs clean
+.PHONY: setup demo test check bench figures docs clean
 
 setup: $(STAMP)
 
@@ -27,6 +27,9 @@ check: setup
 
 bench: setup
 	for name in simulate agreement train_epoch; do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
+
+figures: setup
+	$(BIN)/foretrace figures docs/results/paper
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

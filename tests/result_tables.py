@@ -50,7 +50,7 @@ def paper_like(num_seeds: int = 10, noise: float = 0.01) -> pd.DataFrame:
         for n in ("2", "3", "4", "5"):
             add("steps-ahead", name, n, "full", error + 0.01 * (int(n) - 1))
         for pair in PAIRS:
-            worse = {"im-cnn": 1.1, "sc-cnn": 1.1, "sc-800": 1.9}.get(name, 1.3)
+            worse = {"im-cnn": 1.1, "sc-cnn": 1.1, "sc-800": 1.6}.get(name, 1.3)
             poor = pair == "3&4" and name in ("sp-pred", "sp-truth", "sp-rule", "ae-256", "ae-512", "sc-800")
             add("novel-corners", name, pair, "full", error * (worse + (0.4 if poor else 0)), noise / 2)
     return pd.DataFrame(rows, columns=COLUMNS)

@@ -70,7 +70,7 @@ def figure_9a(table: pd.DataFrame) -> Figure | None:
     grid(ax, ylim=(0, 103), xlim=(0, 103), xlabel="training interactions used [%]", ylabel="accuracy [%]")
     ends = {"paper: 93 %": PAPER_ACCURACY}
     for name in present(rows):
-        numbers = intervals(rows, name, settings, scale=100)
+        numbers = intervals(rows, name, settings, scale=100.0)
         draw_line(ax, x, numbers, LOOKS[name])
         ends[name] = last(numbers)
     reference(ax, PAPER_ACCURACY)
@@ -89,7 +89,7 @@ def figure_9b(table: pd.DataFrame) -> Figure | None:
     ax = fig.add_subplot()
     grid(ax, ylim=(0, 103), ylabel="accuracy [%]", xlabel="corner counts held out of the training")
     names = present(rows)
-    draw_groups(ax, rows, names, scale=100)
+    draw_groups(ax, rows, names, scale=100.0)
     reference(ax, PAPER_NOVEL_ACCURACY)
     label_ends(ax, {"paper: 89 %": PAPER_NOVEL_ACCURACY})
     legend(fig, names, lines=False)
@@ -206,7 +206,7 @@ def figure_12(table: pd.DataFrame) -> Figure | None:
     pairs = several[["features", "seed"]].drop_duplicates()
     rows = pd.concat([one.merge(pairs), several])
     fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
-    for ax in draw_panels(fig, rows, ("1", *STEPS), range(1, 6)):
+    for ax in draw_panels(fig, rows, ("1", *STEPS), [1.0, 2.0, 3.0, 4.0, 5.0]):
         ax.set(xticks=range(1, 6), xlim=(0.7, 5.3), xlabel="states predicted at once, n")
     finish(fig, "Error against the number of states predicted at once",
            f"means and 95 % intervals over {seeds_in_words(rows)}; grey: the other families")  # fmt: skip
