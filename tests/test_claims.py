@@ -88,7 +88,7 @@ def test_an_interval_on_both_sides_leaves_a_claim_undecided(table):
     noisy.loc[chosen, "value"] = 0.25 + np.where(noisy.loc[chosen, "seed"] % 2 == 0, 0.1, -0.1)
     row = next(row for row in judge_claims(noisy) if row["name"] == "im-cnn-best-generic")
     assert row["holds"] == "undecided"
-    assert tally(row) == "of 6 comparisons 5 supported, 1 open"
+    assert tally(row) == "of 6 comparisons 5 supported, 1 open (ae-512 minus im-cnn)"
 
 
 def test_a_missing_predictor_leaves_a_claim_undecided_and_says_so(table):

@@ -308,13 +308,18 @@ def judge_claims(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def tally(row: dict[str, Any]) -> str:
-    """A judged claim's numbers in a line: a single deciding check in full, or how many of several are supported."""
+    """A judged claim's numbers in a line: a single deciding check in full, or how many of several are supported, and which are not."""
     deciding = [number for number in row["numbers"] if number["needed"]]
     if len(deciding) == 1:
         return f"{deciding[0]['comparison']}: {_interval(deciding[0])}"
-    results = [number["result"] for number in deciding]
-    counts = [f"{results.count(kind)} {kind}" for kind in dict.fromkeys(results)]
-    return f"of {len(results)} comparisons " + ", ".join(counts)
+    kinds: dict[str, list[str]] = {}
+    for number in deciding:
+        kinds.setdefault(number["result"], []).append(number["comparison"])
+    parts = [
+        f"{len(names)} {kind}" + (f" ({', '.join(names)})" if kind in ("contradicted", "open") else "")
+        for kind, names in kinds.items()
+    ]
+    return f"of {len(deciding)} comparisons " + ", ".join(parts)
 
 
 def _interval(number: dict[str, Any]) -> str:

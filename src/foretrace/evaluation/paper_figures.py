@@ -127,7 +127,7 @@ def figure_10(table: pd.DataFrame, metric: str) -> Figure | None:
     ax.set_ylabel(ERRORS[metric])
     note = f"boxes, whiskers to the extremes, and every seed; {seeds_in_words(rows)}"
     if not ahead.empty:
-        note += f"; black bars: only the half plane ahead, {seeds_in_words(ahead)}"
+        note += f"; black: mean, half plane ahead only, {seeds_in_words(ahead)}"
     finish(fig, f"Prediction {ERRORS[metric].removesuffix(' [cm]')}", note)
     return fig
 
@@ -154,7 +154,7 @@ def figure_10_by_object(table: pd.DataFrame) -> Figure | None:
         ax.set_ylabel(ERRORS[metric])
     finish(fig, "Prediction error on objects that were not learned from",
            f"boxes, whiskers to the extremes, and every seed; {seeds_in_words(pd.concat(by_object.values()))}; "
-           "black bars: mean with all interactions shuffled, as in the paper")  # fmt: skip
+           "black: mean with all interactions shuffled, as in the paper")  # fmt: skip
     return fig
 
 
