@@ -298,7 +298,7 @@ NOVEL_CLAIMS = (
 )  # fmt: skip
 
 CLAIMS = SUPPORT_POINT_CLAIMS + FEATURE_CLAIMS + SIZE_CLAIMS + NOVEL_CLAIMS
-"""Every claim of the paper's sections 5.1 to 5.3 that a table can be asked about, in the paper's order."""
+"""Every claim of the paper's sections 5.1 to 5.3 that a table can be asked about."""
 
 
 def judge_claims(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -308,7 +308,7 @@ def judge_claims(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def tally(row: dict[str, Any]) -> str:
-    """A judged claim's numbers in a line: a single deciding check in full, or how many of several are supported, and which are not."""
+    """A judged claim's numbers in a line: a single deciding check in full; of several, how many are supported."""
     deciding = [number for number in row["numbers"] if number["needed"]]
     if len(deciding) == 1:
         return f"{deciding[0]['comparison']}: {_interval(deciding[0])}"
