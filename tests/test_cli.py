@@ -9,6 +9,7 @@ import pytest
 
 import factories
 from foretrace import cli
+from foretrace.evaluation.results import read_results
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 
@@ -109,7 +110,73 @@ def test_show_refuses_what_it_cannot_draw(folder, capsys):
     assert "no interaction 104" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["doctor", "--help"]])
+def test_evaluate_paper_goes_on_and_prints_what_it_found(folder, tmp_path, capsys):
+    out = tmp_path / "results"
+    command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1 --epochs 1".split()
+    command += ["--experiments", "features", "support-points", "--settings", "shuffled", "100"]
+    command += ["--features", "none", "sp-rule"]
+    capsys.readouterr()
+    assert cli.main([*command, "--seeds", "0", "1", "--dry-run"]) == 0
+    assert capsys.readouterr().out.split() == [
+        *("features", "4", "trainings", "missing"),
+        *("support-points", "2", "trainings", "missing"),
+    ]
+    assert not out.exists()
+    assert cli.main([*command, "--seeds", "0"]) == 0
+    assert cli.main([*command, "--seeds", "0", "1", "--dry-run"]) == 0
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()[-2:]] == ["2", "1"]
+    assert cli.main([*command, "--seeds", "0", "1"]) == 0
+    printed = capsys.readouterr()
+    assert "3 of 6 trainings are there already" in printed.err
+    assert "features: mean error in cm, 95 % interval (seeds)" in printed.out
+    table = read_results(out)
+    values = table[(table["metric"] == "full") & (table["features"] == "none")]["value"]
+    assert f"{values.mean():.3f} (2)" in printed.out
+    assert f"{values.min():.3f} to {values.max():.3f}" in printed.out
+    assert printed.out.splitlines()[-1] == f"results: {out}"
+    with (out / "results.csv").open("a") as file:
+        file.write("features,none,2,shuffled,full,0.1\n")
+    assert cli.main([*command, "--seeds", "0", "1"]) == 0
+    assert read_results(out).equals(table)
+    assert cli.main([*command, "--epochs", "2"]) == 2
+    assert "recipe.epochs = 1, asked for is 2" in capsys.readouterr().err
+
+
+def test_evaluate_paper_tells_of_trainings_that_failed(fake_physics, tmp_path, capsys):
+    folder, out = tmp_path / "data", tmp_path / "results"
+    assert cli.main(["simulate", "--out", str(folder), "--objects", "5", "--workers", "1"]) == 0
+    command = f"evaluate paper --data {folder} --out {out} --proportional --seeds 0 --workers 1".split()
+    command += ["--experiments", "support-points-novel", "--features", "chance"]
+    assert cli.main(command) == 1
+    printed = capsys.readouterr().err
+    assert "failed: support-points-novel 9&10, chance, seed 0: no object has [9, 10] corners" in printed
+    assert set(read_results(out)["setting"]) == {"3&4", "5&6"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--features", "sift"], "features 'sift' is unknown: choose from sp-pred"),
+        (["--experiments", "all"], "experiment 'all' is unknown: choose from support-points"),
+        (["--settings", "7"], "setting '7' is unknown"),
+        (["--seeds", "-1"], "seed -1 is negative"),
+        ([], "104 levered interactions, the paper's comparisons need 1800"),
+        (["--proportional", "--workers", "0"], "workers is 0"),
+    ],
+)
+def test_evaluate_paper_refuses_in_one_line(options, message, folder, tmp_path, capsys):
+    command = ["evaluate", "paper", "--data", str(folder), "--out", str(tmp_path / "results"), *options]
+    capsys.readouterr()
+    assert cli.main(command) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["simulate", "--help"], ["doctor", "--help"], ["evaluate", "paper", "--help"]]
+)
 def test_help_names_the_options(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         cli.main(arguments)

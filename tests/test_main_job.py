@@ -55,7 +55,7 @@ def test_evaluate_prints_and_writes_the_paper_errors(
     run: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "errors.csv"
-    assert cli.main(["evaluate", str(run), "--data", str(data), "--out", str(out)]) == 0
+    assert cli.main(["evaluate", "predictor", str(run), "--data", str(data), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "median" in printed
     assert "all, start from view" in printed
@@ -140,7 +140,7 @@ def test_wrong_input_is_one_clear_line(
         ],
         "none, im-cnn": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--features", "sift"],
         str(tmp_path / "empty"): ["predict", str(tmp_path / "empty"), *shape, "--edge", "0"],
-        "is missing": ["evaluate", str(data), "--data", str(data)],
+        "is missing": ["evaluate", "predictor", str(data), "--data", str(data)],
     }
     for expected, arguments in cases.items():
         assert expected in error_of(arguments, capsys), arguments

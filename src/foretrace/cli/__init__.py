@@ -1,12 +1,15 @@
 """The command line: ``foretrace simulate | train | predict | ...``.
 
-A command is a function of plain arguments in `COMMANDS`; tyro makes the options from its signature and the help from
-its docstring. Whatever is slow to import is imported inside, so that ``foretrace --help`` answers at once.
+A command is a function of plain arguments in `COMMANDS`, or a `Group` of such; tyro makes the options from its
+signature and the help from its docstring. Whatever is slow to import is imported inside, so that
+``foretrace --help`` answers at once.
 """
 
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Union
 
 import tyro
 
@@ -14,15 +17,32 @@ import foretrace
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
+from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
 from foretrace.cli.figures import figures
-from foretrace.cli.learning import evaluate, predict, train
+from foretrace.cli.learning import predict, train
 from foretrace.errors import ForetraceError
 
-COMMANDS: dict[str, Callable[..., int | None]] = {
+Command = Callable[..., int | None]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Several commands under one name."""
+
+    summary: str
+    """What they have in common, in a line."""
+    commands: Mapping[str, Command]
+    """Each by its name within the group."""
+
+
+COMMANDS: dict[str, Command | Group] = {
     "demo": demo,
     "simulate": simulate,
     "train": train,
-    "evaluate": evaluate,
+    "evaluate": Group(
+        "Errors of one predictor, or the paper's comparisons of all of them.",
+        {"predictor": evaluate_predictor, "paper": evaluate_paper},
+    ),
     "figures": figures,
     "predict": predict,
     "show": show,
@@ -35,7 +55,8 @@ COMMANDS: dict[str, Callable[..., int | None]] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done. 1: `doctor` has something left to mend. 2: an error, printed as one line. 130: interrupted.
+    0: done. 1: `doctor` has something left to mend, or trainings of `evaluate paper` failed. 2: an error, printed as
+    one line. 130: interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if list(arguments) == ["--version"]:
@@ -44,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:
-            status = tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
+            status = tyro.cli(
+                _choice(COMMANDS),
                 prog="foretrace",
                 description="Predict how an object will move before the robot touches it.",
                 args=arguments,
@@ -56,3 +77,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             return 130
     return status or 0
+
+
+def _choice(commands: Mapping[str, Command | Group]) -> Any:
+    """One of several commands, as a type that tyro understands."""
+    known = []
+    for name, command in commands.items():
+        if isinstance(command, Group):
+            nested = tyro.conf.subcommand(
+                name, constructor=_choice(command.commands), description=command.summary
+            )
+            known.append(Annotated[Any, nested])
+        else:
+            known.append(Annotated[Any, tyro.conf.subcommand(name, constructor=command)])
+    return Union[tuple(known)]  # noqa: UP007

@@ -4,7 +4,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foretrace.cli.learning import print_errors, read_mask
+from foretrace.cli.evaluation import print_errors
+from foretrace.cli.learning import read_mask
 
 if TYPE_CHECKING:
     from foretrace.evaluation.figures import Scene

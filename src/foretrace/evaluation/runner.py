@@ -2,6 +2,7 @@
 
 import os
 import signal
+import warnings
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from typing import NamedTuple, cast
@@ -58,7 +59,9 @@ def run_trials(
     with (
         _Report(console or Console(stderr=True), len(set(trials)), len(missing)) as report,
         parallel_config("loky", n_jobs=max(1, min(workers, len(missing))), inner_max_num_threads=threads),
+        warnings.catch_warnings(),
     ):
+        warnings.filterwarnings("ignore", message=".*still being processed by the workers")  # after Ctrl-C
         jobs = (delayed(_attempt)(work, trial, os.getpid()) for trial in missing)
         # One at a time: joblib would hand over short ones in batches, and hold them back until the batch is done.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs")  # pyright: ignore[reportArgumentType]
