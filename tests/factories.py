@@ -15,8 +15,8 @@ from foretrace.objects import ObjectModel, sample_prism
 SAMPLE_PERIOD = 0.05
 FINAL_TILT = np.radians(40)
 QUICK_OPTIONS: dict[str, dict[str, int]] = {
-    "ae-256": {"epochs": 2, "width": 8},
-    "ae-512": {"epochs": 2, "width": 8},
+    "ae-256": {"epochs": 2, "min_steps": 1, "width": 8},
+    "ae-512": {"epochs": 2, "min_steps": 1, "width": 8},
     "sp-pred": {"epochs": 5},
 }
 """Settings with which features that train on their own are quick to fit."""

@@ -22,10 +22,10 @@ from foretrace.interactions.splits import Split
 from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
 from foretrace.predictor import training as training_module
 from foretrace.predictor.run_folder import RunFolder
-from foretrace.predictor.training import learning_rate
+from foretrace.predictor.training import learning_rate, parameter_groups
 from foretrace.trajectories import mean_distance
 
-SMALL = TrainConfig(features="none", hidden=16, epochs=3, split=None, window=6, device="cpu")
+SMALL = TrainConfig(features="none", hidden=16, epochs=3, min_steps=1, split=None, window=6, device="cpu")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -142,7 +142,7 @@ def test_a_killed_process_can_go_on(tmp_path, batch):
         from factories import QUICK_OPTIONS, fake_batch
         from foretrace.predictor import TrainConfig, train_predictor
         torch.set_num_threads(1)
-        config = TrainConfig("none", hidden=16, epochs=25, split=None, window=6, device="cpu")
+        config = TrainConfig("none", hidden=16, epochs=25, min_steps=1, split=None, window=6, device="cpu")
         train_predictor(fake_batch(np.random.default_rng(7), 30, num_samples=20), config, sys.argv[1], progress=False)
     """)
     tests = Path(__file__).parent
@@ -180,7 +180,7 @@ def test_a_finished_training_is_not_repeated(tmp_path, batch):
     ("change", "name"),
     [
         ({"hidden": 17}, "settings.hidden"),
-        ({"learning_rate": 2e-3}, r"training.learning_rate = 0.001, not 0.002"),
+        ({"learning_rate": 2e-3}, r"training.learning_rate = 0.008, not 0.002"),
     ],
 )
 def test_a_folder_of_another_configuration_is_refused(tmp_path, batch, change, name):
@@ -303,12 +303,34 @@ def test_the_best_validation_epoch_is_kept(tmp_path, batch, monkeypatch):
     assert not torch.equal(tensors["output.weight"], kept[2]["output.weight"])
 
 
-def test_the_learning_rate_falls_on_plateaus():
-    config = replace(SMALL, learning_rate=1.0, plateau_factor=0.5, plateau_patience=2)
-    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0]) == 1.0
-    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0, 2.0]) == 0.5
-    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.0]) == 0.5
-    assert learning_rate(config, [3.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0]) == 0.25
+def test_the_learning_rate_rises_and_falls():
+    rates = [learning_rate(1.0, share) for share in np.linspace(0, 1, 101)]
+    assert rates[0] == 0.0
+    assert rates[10] == pytest.approx(1.0)
+    assert rates[55] == pytest.approx(0.5)
+    assert rates[100] == pytest.approx(0.0)
+    assert np.argmax(rates) == 10
+    assert (np.diff(rates[10:]) < 0).all()
+
+
+def test_units_with_many_inputs_learn_at_a_lower_rate_and_many_features_decay():
+    predictor = TrainConfig("sc-3200", hidden=512).make_predictor(20)
+    groups = {id(p): group for group in parameter_groups(predictor) for p in group["params"]}
+    assert len(groups) == len(list(predictor.parameters()))
+
+    def setting(parameter):
+        return groups[id(parameter)]["share"], groups[id(parameter)]["weight_decay"]
+
+    assert setting(predictor.lstm.weight_hidden) == (0.5, 0.0)
+    assert setting(predictor.lstm.weight_state) == (1.0, 0.0)
+    assert setting(predictor.lstm.weight_features) == (1.0, 4.0)
+    assert setting(predictor.lstm.bias) == (1.0, 0.0)
+
+
+def test_a_small_training_part_is_passed_over_more_often():
+    config = TrainConfig(epochs=15, min_steps=300, batch_size=32)
+    assert config.num_epochs(1400) == 15
+    assert config.num_epochs(36) == 150
 
 
 def test_features_that_do_not_train_are_computed_once(tmp_path, batch, monkeypatch):

@@ -25,9 +25,9 @@ def train(
     features: str = "im-cnn",
     state: Literal["position", "pose"] = "position",
     steps_ahead: int = 1,
-    epochs: int = 20,
+    epochs: int = 15,
     batch_size: int = 32,
-    learning_rate: float = 6e-3,
+    learning_rate: float = 8e-3,
     outcomes: tuple[str, ...] = ("levered",),
     split: tuple[int, int, int] | None = None,
     seed: int = 0,
@@ -45,7 +45,7 @@ def train(
         features: What the predictor knows about the object; an unknown label lists the choices.
         state: Predict the centre of mass, or the whole pose.
         steps_ahead: States predicted per iteration (n in the paper).
-        epochs: Passes over the training part.
+        epochs: Passes over the training part; more where it is small, for 300 optimiser steps at least.
         batch_size: Trajectories per optimiser step.
         learning_rate: Adam's largest learning rate; it rises to it and falls to 0.
         outcomes: Outcomes of the interactions to learn from.

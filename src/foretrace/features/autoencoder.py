@@ -13,6 +13,7 @@ from foretrace.errors import TrainingError
 from foretrace.features.base import FeatureExtractor, FitPart
 from foretrace.features.cnn import initialise_rectified
 from foretrace.features.fitting import FitConfig, fit_network
+from foretrace.features.windows import convolve_windows, crop, find_windows, paste
 from foretrace.interactions.dataset import InteractionBatch
 
 ROWS_AT_ONCE = 32
@@ -40,21 +41,25 @@ class Autoencoder(nn.Module):
         # With channels last a CPU needs 0.6 of the time.
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def encode(self, images: Float[Tensor, "batch 1 128 128"]) -> Float[Tensor, "batch code 8 8"]:
-        """The activation of the bottleneck."""
+    def encode(
+        self, images: Float[Tensor, "batch 1 height width"]
+    ) -> Float[Tensor, "batch code rows columns"]:
+        """The activation of the bottleneck, of a sixteenth of the images' size."""
         x = images.contiguous(memory_format=torch.channels_last)
         for convolution in self.encoder:
             x = F.relu(F.max_pool2d(convolution(x), 2))
         return x
 
-    def decode(self, codes: Float[Tensor, "batch code 8 8"]) -> Float[Tensor, "batch 1 128 128"]:
+    def decode(
+        self, codes: Float[Tensor, "batch code rows columns"]
+    ) -> Float[Tensor, "batch 1 height width"]:
         """Logits of the pixels."""
         x = codes
         for convolution in self.decoder:
             x = F.interpolate(F.relu(convolution(x)), scale_factor=2)
         return self.output(x)
 
-    def forward(self, images: Float[Tensor, "batch 1 128 128"]) -> Float[Tensor, "batch 1 128 128"]:
+    def forward(self, images: Float[Tensor, "batch 1 height width"]) -> Float[Tensor, "batch 1 height width"]:
         """Logits of the pixels after the bottleneck."""
         return self.decode(self.encode(images))
 
@@ -66,10 +71,10 @@ class AutoencoderFeatures(FeatureExtractor):
     trained; then it is frozen. The code is divided by its root mean square over the training part.
 
     Args:
-        epochs: Passes over the training part, at most.
+        epochs: Passes over the training part.
         batch_size: Images per optimiser step.
-        learning_rate: Adam's learning rate.
-        patience: Epochs without a smaller validation loss after which its training stops.
+        learning_rate: Adam's largest learning rate; it rises to it and falls to 0.
+        min_steps: Optimiser steps, at least: few images are passed over more often.
         width: Channels of the first two convolutions, 128 in the paper; the third has half as many.
     """
 
@@ -79,10 +84,10 @@ class AutoencoderFeatures(FeatureExtractor):
 
     def __init__(
         self,
-        epochs: int = 20,
-        batch_size: int = 32,
-        learning_rate: float = 1e-3,
-        patience: int = 5,
+        epochs: int = 2,
+        batch_size: int = 16,
+        learning_rate: float = 2e-3,
+        min_steps: int = 120,
         width: int = 128,
     ):
         if width < 2:
@@ -91,10 +96,12 @@ class AutoencoderFeatures(FeatureExtractor):
             epochs=epochs,
             batch_size=batch_size,
             learning_rate=learning_rate,
-            patience=patience,
+            min_steps=min_steps,
             width=width,
         )
-        self.config = FitConfig(epochs, batch_size, learning_rate, patience)
+        self.config = FitConfig(
+            epochs, batch_size, learning_rate, patience=10**9, annealed=True, min_steps=min_steps
+        )
         self.network = Autoencoder(width, self.code_channels).requires_grad_(False)
         self.register_buffer("code_scale", torch.ones(()))
 
@@ -134,17 +141,27 @@ class AutoencoderFeatures(FeatureExtractor):
 
     def reconstruct(self, inputs: UInt8[Tensor, "batch 1 128 128"]) -> Float[Tensor, "batch 1 128 128"]:
         """The masks as the code retains them: each pixel's probability of showing the object."""
-        parts = [torch.sigmoid(self.network(part.float())) for part in inputs.split(ROWS_AT_ONCE)]
+        parts = []
+        for images in inputs.split(ROWS_AT_ONCE):
+            restored = torch.zeros_like(images, dtype=torch.float32)
+            for part in find_windows(images):
+                paste(restored, part, torch.sigmoid(self.network(crop(images, part).float())))
+            parts.append(restored)
         return torch.cat(parts)
 
     def _codes(self, inputs: Tensor) -> Tensor:
-        return torch.cat([self.network.encode(part.float()) for part in inputs.split(ROWS_AT_ONCE)])
+        encode, channels = self.network.encode, self.code_channels
+        return torch.cat([convolve_windows(part, encode, channels) for part in inputs.split(ROWS_AT_ONCE)])
 
     def _loss(self, images: Tensor, reduced: bool = False) -> Tensor:
-        target = images.float()
-        with torch.autocast(images.device.type, dtype=torch.bfloat16, enabled=reduced):
-            logits = self.network(target)
-        return F.binary_cross_entropy_with_logits(logits.float(), target)
+        """Mean over the pixels of the images; those beside the windows are told right without being looked at."""
+        total = torch.zeros((), device=images.device)
+        for part in find_windows(images):
+            target = crop(images, part).float()
+            with torch.autocast(images.device.type, dtype=torch.bfloat16, enabled=reduced):
+                logits = self.network(target)
+            total = total + F.binary_cross_entropy_with_logits(logits.float(), target, reduction="sum")
+        return total / images.numel()
 
     def _mean_loss(self, images: Tensor) -> float:
         losses = [self._loss(part) * len(part) for part in images.split(ROWS_AT_ONCE)]

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from foretrace.features.base import FeatureExtractor, Option
 from foretrace.features.shape_context import ShapeContext3200, shape_contexts
+from foretrace.features.windows import convolve_windows
 from foretrace.interactions.dataset import InteractionBatch
 
 CHANNELS = (32, 64, 128, 256)
@@ -83,12 +84,18 @@ class ConvolutionalFeatures(FeatureExtractor):
         """Convolutions in ``precision`` while training, the dense layer always in float32."""
         reduced = self.training and self.precision == "bfloat16"
         with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=reduced):
-            maps = self.stack(inputs.float())
+            maps = self.maps(inputs)
         return self.dropout(F.relu(self.dense(maps.float().flatten(1))))
+
+    def maps(self, inputs: Shaped[Tensor, "batch 1 rows columns"]) -> Shaped[Tensor, "batch 256 r c"]:
+        """What the convolutions make of the inputs."""
+        return self.stack(inputs.float())
 
 
 class ImageCnn(ConvolutionalFeatures):
     """``im-cnn``: a convolutional network on the top-down view, whose last maps have 8x8x256 cells.
+
+    Blank table around the object is not convolved: see `foretrace.features.windows`.
 
     Args:
         channel: What it looks at: the object's ``mask`` or its ``height`` map.
@@ -107,6 +114,10 @@ class ImageCnn(ConvolutionalFeatures):
         if self.channel == "mask":
             return torch.from_numpy(batch.mask).to(torch.uint8)[:, None]
         return torch.from_numpy(batch.height).float()[:, None] / HEIGHT_SCALE
+
+    def maps(self, inputs: Shaped[Tensor, "batch 1 128 128"]) -> Shaped[Tensor, "batch 256 8 8"]:
+        """The maps of the window in which the object lies; nothing beside it."""
+        return convolve_windows(inputs, self.stack, CHANNELS[-1])
 
 
 class ShapeContextCnn(ConvolutionalFeatures):

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 from foretrace.errors import PredictionError
-from foretrace.features import FeatureExtractor
+from foretrace.features import FeatureExtractor, Precision
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, TopDownView
 from foretrace.predictor.states import StateKind, decode_poses, rest_states, state_size
@@ -103,6 +103,11 @@ class EffectPredictor(nn.Module, ABC):
         """Whole trajectories of normalised states from the first state alone, ``first`` included."""
 
     @property
+    @abstractmethod
+    def feature_weights(self) -> list[nn.Parameter]:
+        """The weight matrices that features are multiplied with."""
+
+    @property
     def num_samples(self) -> int:
         """Samples in an imagined trajectory."""
         return len(self.times)
@@ -111,6 +116,10 @@ class EffectPredictor(nn.Module, ABC):
     def device(self) -> torch.device:
         """Where the predictor's tensors are."""
         return self.state_mean.device
+
+    def set_precision(self, precision: Precision) -> None:
+        """Fix the number format of the large products in training; evaluation is always in float32."""
+        self.features.precision = precision
 
     def set_normalisation(
         self,

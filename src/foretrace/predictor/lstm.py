@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features import FeatureExtractor
+from foretrace.features import FeatureExtractor, Precision
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.states import StateKind, state_size
 
@@ -48,6 +48,8 @@ class ProjectedLstm(nn.Module):
     def __init__(self, num_states: int, num_features: int, hidden: int):
         super().__init__()
         self.hidden = hidden
+        self.precision: Precision = "float32"
+        """Number format of the products with the recurrent weights in training mode."""
         # Gates in the order input, forget, cell, output.
         weight_input = torch.empty(4 * hidden, num_states + num_features)
         nn.init.xavier_uniform_(weight_input)
@@ -92,8 +94,9 @@ class ProjectedLstm(nn.Module):
             nothing = states.new_zeros(len(states), self.hidden)
             memory = nothing, nothing
         output, cell = (part.detach() for part in memory)
+        reduced = self.training and self.precision == "bfloat16"
         outputs, cell = _LstmSequence.apply(
-            states, projected, self.weight_state, self.weight_hidden, output, cell
+            states, projected, self.weight_state, self.weight_hidden, output, cell, reduced
         )
         return outputs, (outputs[:, -1].detach(), cell)
 
@@ -101,8 +104,9 @@ class ProjectedLstm(nn.Module):
 class _LstmSequence(torch.autograd.Function):
     """A sequence of steps as one node of the graph.
 
-    Up to twice as fast on a CPU as letting autograd record each step: activations are overwritten in place,
-    and the gradient of the recurrent weights is one large product over all steps.
+    Three times as fast on a CPU as letting autograd record each step: what does not depend on the step before is
+    computed for all steps at once, activations are overwritten in place, and the products with the recurrent
+    weights are in bfloat16 where the hardware multiplies that faster.
     """
 
     @staticmethod
@@ -114,55 +118,61 @@ class _LstmSequence(torch.autograd.Function):
         weight_hidden: Tensor,
         first_output: Tensor,
         first_cell: Tensor,
+        reduced: bool,
     ) -> tuple[Tensor, Tensor]:
         batch, time, _ = states.shape
         hidden = weight_hidden.shape[1]
+        product = torch.bfloat16 if reduced else weight_hidden.dtype
+        weight = weight_hidden.to(product)
         x = states.transpose(0, 1)  # (time, batch, state)
-        outputs, cells = x.new_empty(time + 1, batch, hidden), x.new_empty(time + 1, batch, hidden)
+        cells = x.new_empty(time + 1, batch, hidden)
+        outputs = torch.empty_like(cells, dtype=product)
         outputs[0], cells[0] = first_output, first_cell
-        gates = x.new_empty(time, batch, 4 * hidden)
-        squashed = x.new_empty(time, batch, hidden)
+        squashed = torch.empty_like(cells[1:])
+        gates = (x @ weight_state.t()).add_(projected)
         for t in range(time):
-            torch.addmm(projected, x[t], weight_state.t(), out=gates[t])
-            gates[t].addmm_(outputs[t], weight_hidden.t())
+            gates[t].add_(outputs[t] @ weight.t())
             enter, forget, new, leave = gates[t].chunk(4, dim=1)
             gates[t, :, : 2 * hidden].sigmoid_()
             new.tanh_()
             leave.sigmoid_()
             torch.mul(enter, new, out=cells[t + 1]).addcmul_(forget, cells[t])
             torch.tanh(cells[t + 1], out=squashed[t])
-            torch.mul(leave, squashed[t], out=outputs[t + 1])
-        ctx.save_for_backward(x, weight_state, weight_hidden, outputs, cells, gates, squashed)
+            outputs[t + 1] = leave * squashed[t]
+        ctx.save_for_backward(x, weight_state, weight, outputs, cells, gates, squashed)
         last_cell = cells[-1].clone()
         ctx.mark_non_differentiable(last_cell)
-        return outputs[1:].transpose(0, 1), last_cell
+        return outputs[1:].transpose(0, 1).to(x.dtype), last_cell
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight_state, weight_hidden, outputs, cells, gates, squashed = ctx.saved_tensors
+        x, weight_state, weight, outputs, cells, gates, squashed = ctx.saved_tensors
         time, batch, width = gates.shape
-        sigmoid_back, tanh_back = torch.ops.aten.sigmoid_backward, torch.ops.aten.tanh_backward
         grad = grads[0].transpose(0, 1)
-        grad_gates = torch.empty_like(gates)
-        grad_output = torch.zeros_like(outputs[0])
-        grad_cell = torch.zeros_like(outputs[0])
+        enter, forget, new, leave = gates.chunk(4, dim=2)
+        # How the cell answers to its three gates, and the output to its gate and to the cell: (time, batch, hidden).
+        by_enter, by_forget = new * enter * (1 - enter), cells[:-1] * forget * (1 - forget)
+        by_gate = torch.cat([by_enter, by_forget, enter * (1 - new.square())], dim=2).unflatten(2, (3, -1))
+        by_leave, by_cell = squashed * leave * (1 - leave), leave * (1 - squashed.square())
+        grad_gates = torch.empty_like(gates, dtype=weight.dtype)
+        grad_output, grad_cell = torch.zeros_like(cells[0]), torch.zeros_like(cells[0])
         for t in reversed(range(time)):
-            enter, forget, new, leave = gates[t].chunk(4, dim=1)
-            to_enter, to_forget, to_new, to_leave = grad_gates[t].chunk(4, dim=1)
             grad_output = grad_output + grad[t]
-            grad_cell = grad_cell + tanh_back(grad_output * leave, squashed[t])
-            to_enter.copy_(sigmoid_back(grad_cell * new, enter))
-            to_forget.copy_(sigmoid_back(grad_cell * cells[t], forget))
-            to_new.copy_(tanh_back(grad_cell * enter, new))
-            to_leave.copy_(sigmoid_back(grad_output * squashed[t], leave))
-            grad_cell = grad_cell * forget
+            grad_cell = torch.addcmul(grad_cell, grad_output, by_cell[t])
+            to_gates = grad_gates[t].unflatten(1, (4, -1))
+            to_gates[:, :3] = by_gate[t] * grad_cell[:, None]
+            to_gates[:, 3] = grad_output * by_leave[t]
+            grad_cell = grad_cell * forget[t]
             if t > 0:
-                grad_output = grad_gates[t] @ weight_hidden
+                grad_output = (grad_gates[t] @ weight).to(x.dtype)
         flat = grad_gates.view(time * batch, width)
-        grad_hidden = flat.t() @ outputs[:time].reshape(time * batch, -1)
-        grad_state = flat.t() @ x.reshape(time * batch, -1)
-        grad_x = (grad_gates @ weight_state).transpose(0, 1) if ctx.needs_input_grad[0] else None
-        return grad_x, grad_gates.sum(0), grad_state, grad_hidden, None, None
+        grad_hidden = (flat.t() @ outputs[:time].reshape(time * batch, -1)).to(x.dtype)
+        grad_state = (flat.t() @ x.reshape(time * batch, -1).to(weight.dtype)).to(x.dtype)
+        grad_x = None
+        if ctx.needs_input_grad[0]:
+            grad_x = (grad_gates.to(x.dtype) @ weight_state).transpose(0, 1)
+        grad_projected = grad_gates.sum(0, dtype=x.dtype)
+        return grad_x, grad_projected, grad_state, grad_hidden, None, None, None
 
 
 class LstmPredictor(EffectPredictor):
@@ -194,6 +204,16 @@ class LstmPredictor(EffectPredictor):
     def config(self) -> LstmConfig:
         """Settings."""
         return self._config
+
+    @property
+    def feature_weights(self) -> list[nn.Parameter]:
+        """Those of the gates."""
+        return [self.lstm.weight_features]
+
+    def set_precision(self, precision: Precision) -> None:
+        """Fix the number format of the large products in training."""
+        super().set_precision(precision)
+        self.lstm.precision = precision
 
     def training_loss(
         self,

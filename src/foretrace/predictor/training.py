@@ -2,8 +2,9 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -13,14 +14,18 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
-from torch import Tensor
+from safetensors.torch import load_file
+from torch import Tensor, nn
 
 from foretrace.errors import TrainingError
-from foretrace.features import make_features
+from foretrace.features import FeatureExtractor, make_features
 from foretrace.features.base import FitPart, Option, fast_precision
+from foretrace.features.fitting import learning_rate
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.checkpoint import load_tensors
+from foretrace.predictor.files import write_tensors
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
 from foretrace.predictor.states import (
@@ -31,6 +36,11 @@ from foretrace.predictor.states import (
     valid_samples,
 )
 from foretrace.trajectories import final_distance, mean_distance
+
+FULL_RATE_INPUTS = 256
+"""Units with more inputs than this learn at a lower rate."""
+FEATURE_DECAY = 1 / 800
+"""Weight decay per feature."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +61,14 @@ class TrainConfig:
     """States per training sequence; the LSTM's memory is carried on to the next one."""
     residual: bool = True
     """Whether the network predicts changes of the state, instead of states as in the paper."""
-    epochs: int = 100
-    """Passes over the training part, at most."""
+    epochs: int = 15
+    """Passes over the training part, unless ``min_steps`` asks for more."""
+    min_steps: int = 300
+    """Optimiser steps, at least: a small training part is passed over more often."""
     batch_size: int = 32
     """Trajectories per optimiser step."""
-    learning_rate: float = 1e-3
-    """Adam's learning rate at the start."""
-    plateau_factor: float = 0.8
-    """The learning rate is multiplied by this when the validation loss has stopped falling; 1 to keep it."""
-    plateau_patience: int = 5
-    """Epochs without a smaller validation loss before that happens."""
+    learning_rate: float = 8e-3
+    """Adam's largest learning rate: it is reached after a tenth of the steps and falls to 0 along a cosine."""
     outcomes: tuple[str, ...] = ("levered",)
     """Outcomes of the interactions to learn from and to judge by."""
     split: tuple[int, int, int] | None = PAPER_SIZES
@@ -75,11 +83,15 @@ class TrainConfig:
     """Threads of PyTorch on the CPU; None leaves its choice. More than the idle cores make it slower."""
 
     def __post_init__(self) -> None:
-        for name in ("steps_ahead", "hidden", "window", "epochs", "batch_size"):
+        for name in ("steps_ahead", "hidden", "window", "epochs", "min_steps", "batch_size"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.learning_rate > 0:
             raise TrainingError(f"learning_rate must be positive, not {self.learning_rate}")
+
+    def num_epochs(self, size: int) -> int:
+        """Passes over a training part of so many interactions."""
+        return max(self.epochs, math.ceil(self.min_steps / math.ceil(size / self.batch_size)))
 
     def make_predictor(self, num_samples: int) -> EffectPredictor:
         """The untrained predictor that these settings ask for."""
@@ -97,6 +109,43 @@ class _Part:
     """Inputs of the features."""
     states: np.ndarray
     """(batch, time, state) in the action frame [m], zeros past the valid length."""
+
+
+def fit_predictor(
+    batch: InteractionBatch,
+    config: TrainConfig,
+    split: Split,
+    *,
+    inputs: Tensor | None = None,
+    fitted: Path | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> tuple[EffectPredictor, Progress]:
+    """Train a predictor in memory; `train_predictor` does the same and leaves a folder.
+
+    Args:
+        batch: The interactions.
+        config: Settings; its ``split`` and ``outcomes`` are not looked at.
+        split: Rows of ``batch`` in each part, all with at least two valid samples.
+        inputs: What the features' ``inputs`` make of the whole ``batch``, where that is known already.
+        fitted: Folder that keeps what feature extractors have learned on their own, for further trainings on the
+            same parts and seed.
+        report: Takes a line on the progress.
+
+    Returns:
+        The predictor of the best validation epoch, and the metrics of all epochs.
+
+    Raises:
+        TrainingError: Unknown features or device, or a loss that is no longer finite.
+    """
+    with _thread_count(config.threads), _made(config, batch) as predictor:
+        keeper = _Memory()
+        inputs = predictor.features.inputs(batch) if inputs is None else inputs
+        train, validation = (
+            _prepare(batch[rows], predictor, inputs[rows]) for rows in (split.train, split.validation)
+        )
+        progress = _Training(config, predictor, keeper, train, validation, fitted).run(report)
+        predictor.load_state_dict(keeper.model)
+    return predictor.eval(), progress
 
 
 def train_predictor(
@@ -131,11 +180,8 @@ def train_predictor(
     """
     batch = data if isinstance(data, InteractionBatch) else data.batch()
     split = _choose_split(batch, config) if split is None else split
-    device = find_device(config.device)
-    precision = fast_precision(device) if config.precision == "auto" else config.precision
     folder = RunFolder(out)
-    with _seeded(config.seed, 0, device), _thread_count(config.threads):
-        predictor = config.make_predictor(batch.com.shape[1])
+    with _thread_count(config.threads), _made(config, batch) as predictor:
         surroundings = ("device", "threads", "precision")
         training = {name: value for name, value in asdict(config).items() if name not in surroundings}
         training |= {"data": fingerprint(batch), "rows": _hash_split(split)}
@@ -145,15 +191,36 @@ def train_predictor(
         folder.write_split(batch, split)
         threads = torch.get_num_threads()
         folder.write_environment(
-            {"seed": config.seed, "data": training["data"], "device": str(device), "precision": precision}
-            | {"threads": threads}
+            {"seed": config.seed, "data": training["data"], "device": str(predictor.device)}
+            | {"precision": predictor.features.precision, "threads": threads}
         )
-        predictor.to(device)
-        predictor.features.precision = precision
-        parts = [_prepare(batch[rows], predictor) for rows in (split.train, split.validation)]
-        _Training(config, predictor, folder, *parts).run(progress)
+        train, validation = (_prepare(batch[rows], predictor) for rows in (split.train, split.validation))
+        with (
+            _display(config.num_epochs(len(split.train)), progress) as (report, show),
+            _tensorboard(folder.path / TENSORBOARD) as log,
+        ):
+
+            def tell(row: Row, done: Progress) -> None:
+                log(row)
+                show(row, done)
+
+            _Training(config, predictor, folder, train, validation).run(report, tell)
     folder.finish()
     return folder.path
+
+
+class _Memory:
+    """Keeps the best model as a `RunFolder` does, but not beyond the process."""
+
+    model: dict[str, Tensor]
+
+    def save(self, progress: Progress, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
+        """Note the end of an epoch."""
+        if progress.best_epoch == progress.epoch:
+            self.model = {name: tensor.clone() for name, tensor in predictor.state_dict().items()}
+
+    def restore(self, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
+        """There is never anything to go on from."""
 
 
 class _Training:
@@ -163,12 +230,14 @@ class _Training:
         self,
         config: TrainConfig,
         predictor: EffectPredictor,
-        folder: RunFolder,
+        keeper: RunFolder | _Memory,
         train: _Part,
         validation: _Part,
+        fitted: Path | None = None,
     ):
-        self.config, self.predictor, self.folder = config, predictor, folder
+        self.config, self.predictor, self.keeper, self.fitted = config, predictor, keeper, fitted
         self.train, self.validation = train, validation
+        self.epochs = config.num_epochs(len(train.batch))
         valid = valid_samples(train.batch)
         mean, scale = state_statistics(train.states, valid, predictor.state)
         predictor.set_normalisation(mean, scale, train.batch.times)
@@ -176,50 +245,71 @@ class _Training:
             predictor.normalise(train.states) * torch.from_numpy(valid).to(predictor.device)[..., None]
         )
         self.lengths = torch.from_numpy(valid_lengths(train.batch)).to(predictor.device)
-        self.optimizer = torch.optim.Adam(
-            [p for p in predictor.parameters() if p.requires_grad], lr=config.learning_rate, fused=True
-        )
+        # The loss of a state's small change is small: Adam's usual epsilon of 1e-8 would outweigh its gradient.
+        self.optimizer = torch.optim.AdamW(parameter_groups(predictor), eps=1e-12, fused=True)
 
-    def run(self, show_progress: bool) -> None:
+    def run(
+        self,
+        report: Callable[[str], None],
+        show: Callable[[Row, Progress], None] = lambda row, progress: None,
+    ) -> Progress:
         """Train until the last epoch."""
-        with _display(self.config.epochs, show_progress) as (report, show):
-            done = self.folder.restore(self.predictor, self.optimizer)
-            if done is None:
-                done = Progress()
-                self._fit_features(report)
-                self.folder.save(done, self.predictor, self.optimizer)
-            fixed = None if self.predictor.features.trainable else self._features_of(self.train)
-            fixed_validation = None if fixed is None else self._features_of(self.validation)
-            with _tensorboard(self.folder.path / TENSORBOARD, done.epoch) as log:
-                while done.epoch < self.config.epochs:
-                    started = perf_counter()
-                    rate = learning_rate(self.config, [row["validation_loss"] for row in done.history])
-                    row = {"epoch": done.epoch + 1, "train_loss": self._epoch(done.epoch + 1, rate, fixed)}
-                    row |= self._validate(fixed_validation)
-                    row |= {"learning_rate": rate, "seconds": perf_counter() - started}
-                    done = done.with_epoch(row)
-                    self.folder.save(done, self.predictor, self.optimizer)
-                    log(row)
-                    show(row, done)
+        done = self.keeper.restore(self.predictor, self.optimizer)
+        if done is None:
+            done = Progress()
+            self._fit_features(report)
+            self.keeper.save(done, self.predictor, self.optimizer)
+        fixed = None if self.predictor.features.trainable else self._features_of(self.train)
+        fixed_validation = None if fixed is None else self._features_of(self.validation)
+        while done.epoch < self.epochs:
+            started = perf_counter()
+            row = {"epoch": done.epoch + 1, "train_loss": self._epoch(done.epoch + 1, fixed)}
+            row |= self._validate(fixed_validation)
+            row |= {
+                "learning_rate": self.optimizer.param_groups[0]["lr"],
+                "seconds": perf_counter() - started,
+            }
+            done = done.with_epoch(row)
+            self.keeper.save(done, self.predictor, self.optimizer)
+            show(row, done)
+        return done
 
     def _fit_features(self, report: Callable[[str], None]) -> None:
-        device = self.predictor.device
+        features, device, seed = self.predictor.features, self.predictor.device, self.config.seed
         train, validation = (FitPart(p.inputs.to(device), p.batch) for p in (self.train, self.validation))
-        self.predictor.features.fit(train, validation, seed=self.config.seed, report=report)
+        if self.fitted is None or type(features).fit is FeatureExtractor.fit:
+            features.fit(train, validation, seed=seed, report=report)
+            return
+        options = json.dumps([features.label, features.options, features.precision, seed])
+        digest = hashlib.sha256(options.encode())
+        for part in (train, validation):
+            digest.update(
+                part.inputs.cpu().contiguous().numpy().tobytes() + part.batch.support_points.tobytes()
+            )
+        file = self.fitted / f"{features.label}-{digest.hexdigest()[:16]}.safetensors"
+        if file.is_file():
+            load_tensors(features, load_file(file), file)
+        else:
+            features.fit(train, validation, seed=seed, report=report)
+            self.fitted.mkdir(parents=True, exist_ok=True)
+            write_tensors(file, features.state_dict())
 
     def _features_of(self, part: _Part) -> Tensor:
         return self.predictor.compute_features(part.inputs)
 
-    def _epoch(self, epoch: int, rate: float, fixed: Tensor | None) -> float:
+    def _epoch(self, epoch: int, fixed: Tensor | None) -> float:
         """One pass over the training part; the mean loss. ``fixed`` are features that do not change."""
         predictor, optimizer, device = self.predictor, self.optimizer, self.predictor.device
-        for group in optimizer.param_groups:
-            group["lr"] = rate
         order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.states))
         total = torch.zeros((), device=device)
         predictor.train()
         with _seeded(self.config.seed, epoch, device):
-            for rows in torch.from_numpy(order).split(self.config.batch_size):
+            batches = torch.from_numpy(order).split(self.config.batch_size)
+            for number, rows in enumerate(batches):
+                share = (epoch - 1 + number / len(batches)) / self.epochs
+                rate = learning_rate(self.config.learning_rate, share)
+                for group in optimizer.param_groups:
+                    group["lr"] = rate * group["share"]
                 features = (
                     predictor.features(self.train.inputs[rows].to(device)) if fixed is None else fixed[rows]
                 )
@@ -250,14 +340,26 @@ class _Training:
         }
 
 
-def learning_rate(config: TrainConfig, losses: list[float]) -> float:
-    """The rate for the next epoch, given the validation losses so far: lowered on every plateau."""
-    rate, best, waited = config.learning_rate, float("inf"), 0
-    for loss in losses:
-        best, waited = (loss, 0) if loss < best else (best, waited + 1)
-        if waited > config.plateau_patience:
-            rate, waited = rate * config.plateau_factor, 0
-    return rate
+def parameter_groups(predictor: EffectPredictor) -> list[dict[str, Any]]:
+    """What is trainable, grouped by its share of the learning rate and by its weight decay.
+
+    One step of Adam changes every weight by about the learning rate, and so what a unit sees by that times its
+    number of inputs. From ``FULL_RATE_INPUTS`` inputs on the rate is therefore lowered in proportion (Yang et
+    al., 2021, "Tensor programs V"). The weights of the features keep the full rate and decay in proportion to
+    the number of features instead (Loshchilov and Hutter, 2019): thousands of them tell every training object
+    apart, four do not.
+    """
+    readers = {id(parameter) for parameter in predictor.feature_weights}
+    groups: dict[tuple[float, float], list[nn.Parameter]] = {}
+    for parameter in predictor.parameters():
+        if parameter.requires_grad:
+            inputs = parameter[0].numel() if parameter.dim() > 1 else 0
+            if id(parameter) in readers:
+                key = 1.0, FEATURE_DECAY * inputs
+            else:
+                key = min(1.0, FULL_RATE_INPUTS / max(1, inputs)), 0.0
+            groups.setdefault(key, []).append(parameter)
+    return [{"params": p, "share": share, "weight_decay": decay} for (share, decay), p in groups.items()]
 
 
 def find_device(name: str) -> torch.device:
@@ -288,8 +390,19 @@ def _hash_split(split: Split) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _prepare(batch: InteractionBatch, predictor: EffectPredictor) -> _Part:
-    return _Part(batch, predictor.features.inputs(batch), encode_states(batch, predictor.state))
+def _prepare(batch: InteractionBatch, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
+    inputs = predictor.features.inputs(batch) if inputs is None else inputs
+    return _Part(batch, inputs, encode_states(batch, predictor.state))
+
+
+@contextmanager
+def _made(config: TrainConfig, batch: InteractionBatch) -> Iterator[EffectPredictor]:
+    """The untrained predictor on its device, and PyTorch's random numbers seeded for its training."""
+    device = find_device(config.device)
+    with _seeded(config.seed, 0, device):
+        predictor = config.make_predictor(batch.com.shape[1]).to(device)
+        predictor.set_precision(fast_precision(device) if config.precision == "auto" else config.precision)
+        yield predictor
 
 
 @contextmanager
@@ -314,15 +427,19 @@ def _thread_count(threads: int | None) -> Iterator[None]:
 
 
 @contextmanager
-def _tensorboard(path: Path, epoch: int) -> Iterator[Callable[[Row], None]]:
+def _tensorboard(path: Path) -> Iterator[Callable[[Row], None]]:
     """A function that logs a row of metrics for TensorBoard."""
     from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
-    with SummaryWriter(str(path), purge_step=epoch + 1) as writer:
+    with ExitStack() as stack:
+        writer: SummaryWriter | None = None
 
         def log(row: Row) -> None:
+            nonlocal writer
+            epoch = int(row["epoch"])
+            writer = writer or stack.enter_context(SummaryWriter(str(path), purge_step=epoch))
             for name, value in row.items():
-                writer.add_scalar(name, value, int(row["epoch"]))
+                writer.add_scalar(name, value, epoch)
             writer.flush()
 
         yield log
