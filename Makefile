@@ -26,7 +26,7 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	for name in simulate agreement train_epoch; do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
+	for name in simulate agreement training; do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 figures: setup
 	$(BIN)/foretrace figures docs/results/paper

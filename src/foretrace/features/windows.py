@@ -19,7 +19,7 @@ def find_windows(images: Shaped[Tensor, "batch 1 height width"]) -> list[Part]:
     """The cells of every image that are worth looking at, images with windows of one size together.
 
     An image's window is the whole image unless everything that is not 0 lies within ``WINDOW`` cells: then it is
-    those, which costs a third. It depends on the image alone, not on the others.
+    those, which costs a third. It depends on the image alone, not on the others; a blank one is looked at whole.
 
     Args:
         images: Views, 0 where no object is, of some multiple of ``CELL`` pixels in height and width.
