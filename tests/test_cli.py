@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from foretrace import cli
 from foretrace.evaluation.results import read_results
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
+from foretrace.predictor.training import fit_predictor
 
 
 @pytest.fixture
@@ -110,7 +112,11 @@ def test_show_refuses_what_it_cannot_draw(folder, capsys):
     assert "no interaction 104" in capsys.readouterr().err
 
 
-def test_evaluate_paper_goes_on_and_prints_what_it_found(folder, tmp_path, capsys):
+def test_evaluate_paper_goes_on_and_prints_what_it_found(folder, tmp_path, capsys, monkeypatch):
+    def train_little(batch, config, *arguments, **options):
+        return fit_predictor(batch, replace(config, hidden=4, min_steps=1), *arguments, **options)
+
+    monkeypatch.setattr("foretrace.evaluation.protocol.fit_predictor", train_little)
     out = tmp_path / "results"
     command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1 --epochs 1".split()
     command += ["--experiments", "features", "support-points", "--settings", "shuffled", "100"]

@@ -1,5 +1,6 @@
 import os
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from foretrace.predictor import TrainConfig
 from foretrace.predictor.training import fit_predictor
 from foretrace.simulation.collect import CollectConfig, collect, trial
 
-RECIPE = Recipe(TrainConfig(hidden=8, epochs=1), factories.QUICK_OPTIONS, proportional=True)
+RECIPE = Recipe(TrainConfig(hidden=8, epochs=1, min_steps=1), factories.QUICK_OPTIONS, proportional=True)
 QUIET = Console(quiet=True)
 FEW = ("none", "im-cnn", "sc-800", "ae-256", "sp-pred")
 TRIALS = [
@@ -124,7 +125,7 @@ def test_settings_and_seeds_make_a_difference(results):
 
 def test_the_shuffled_setting_is_what_train_and_evaluate_would_give(data, results):
     batch = load_levered(data)
-    config = TrainConfig(features="sc-200", hidden=8, epochs=1, seed=0, split=None, threads=1, device="cpu")
+    config = replace(RECIPE.training, features="sc-200", seed=0, threads=1, device="cpu")
     split = split_of(Trial("features", "sc-200", 0, "shuffled"), batch, proportional=True)
     predictor, _ = fit_predictor(batch, config, split)
     rows = evaluate_predictor(predictor, batch[split.test])
@@ -252,7 +253,7 @@ def test_small_data_needs_proportions(data, tmp_path):
 
 def test_another_recipe_needs_another_folder(data, results):
     out = data.parent / "results"
-    other = Recipe(TrainConfig(hidden=8, epochs=2), factories.QUICK_OPTIONS, proportional=True)
+    other = Recipe(TrainConfig(hidden=8, epochs=2, min_steps=1), factories.QUICK_OPTIONS, proportional=True)
     for call in (run_protocol, count_missing):
         with pytest.raises(ResultsError, match=r"recipe\.epochs = 1, asked for is 2"):
             call(data, out, TRIALS, other)

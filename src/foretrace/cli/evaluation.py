@@ -65,7 +65,7 @@ def evaluate_paper(
         features: Which features; by default all.
         settings: Which settings of the experiments; by default all.
         seeds: Seeds of splits and trainings.
-        epochs: Passes over the training part; by default those of `foretrace train`.
+        epochs: Passes over the training part, as in `foretrace train`.
         proportional: Split in the paper's proportions instead of its 1400, 100 and 300 interactions.
         workers: Processes; by default one for each core, and a single one with a CUDA device.
         threads: Threads of each of them.

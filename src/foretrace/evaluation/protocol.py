@@ -23,6 +23,7 @@ from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_
 from foretrace.evaluation.runner import Failure, run_trials
 from foretrace.evaluation.support import support_point_metrics
 from foretrace.features import FEATURES, Option, make_features
+from foretrace.features.base import fast_precision
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import (
@@ -235,7 +236,8 @@ class PaperWork:
         with _thread_count(config.threads):
             if EXPERIMENTS[trial.experiment].features == _SUPPORT:
                 started = perf_counter()
-                found = support_point_metrics(trial.features, batch, split, trial.seed)
+                options = self.recipe.feature_options.get(trial.features, {})
+                found = support_point_metrics(trial.features, batch, split, trial.seed, **options)
                 return found | {"seconds": perf_counter() - started}
             return self._train(trial, config, batch, split)
 
@@ -347,7 +349,10 @@ def run_protocol(
     recipe = recipe or Recipe()
     recipe = replace(recipe, training=replace(recipe.training, device=found, threads=threads))
     identity = _identity(data, recipe)
-    with ResultsTable(out, identity, describe_machine(found, workers, threads)) as table:
+    precision = recipe.training.precision
+    precision = fast_precision(torch.device(found)) if precision == "auto" else precision
+    machine = describe_machine(found, workers, threads) | {"precision": precision}
+    with ResultsTable(out, identity, machine) as table:
         fitted = Path(out) / FITTED
         fitted.mkdir(exist_ok=True)
         (fitted / ".gitignore").write_text("*\n", encoding="utf-8")
