@@ -20,6 +20,7 @@ from foretrace.cli.demo import demo
 from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
 from foretrace.cli.figures import figures
 from foretrace.cli.learning import predict, train
+from foretrace.cli.reconstruction import evaluate_reconstruction
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -41,7 +42,7 @@ COMMANDS: dict[str, Command | Group] = {
     "train": train,
     "evaluate": Group(
         "Errors of one predictor, or the paper's comparisons of all of them.",
-        {"predictor": evaluate_predictor, "paper": evaluate_paper},
+        {"predictor": evaluate_predictor, "paper": evaluate_paper, "reconstruction": evaluate_reconstruction},
     ),
     "figures": figures,
     "predict": predict,
