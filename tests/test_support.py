@@ -7,9 +7,11 @@ import torch
 from factories import fake_batch
 from foretrace.errors import TrainingError
 from foretrace.evaluation.support import CHOICES, support_point_metrics
-from foretrace.features import PredictedSupportPoints
 from foretrace.interactions.splits import Split
 
+QUICK = {"epochs": 8, "batch_size": 8, "snapped": False}
+AT_CONTACT = {"setback": 0.0, "half_width": 0.0}
+"""The synthetic objects are lifted at the contact point itself."""
 SPLIT = Split(np.arange(0, 60), np.arange(60, 70), np.arange(70, 110))
 
 
@@ -18,13 +20,6 @@ def batch():
     """Objects of 3 to 10 corners that turn about the edge that the closed form names."""
     torch.set_num_threads(1)
     return fake_batch(np.random.default_rng(3), 110, num_samples=12)
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """sp-pred learns for a few epochs only."""
-    start = PredictedSupportPoints.__init__
-    monkeypatch.setattr(PredictedSupportPoints, "__init__", lambda self: start(self, epochs=8))
 
 
 def with_points(batch, rows, points):
@@ -36,7 +31,9 @@ def with_points(batch, rows, points):
 def test_the_rule_is_right_where_objects_follow_it(batch):
     wrong = SPLIT.test[batch.num_corners[SPLIT.test] == 4]
     levered = np.array([corners[np.linalg.norm(corners, axis=1).argsort()[:2]] for corners in batch.corners])
-    metrics = support_point_metrics("sp-rule", with_points(batch, wrong, levered[wrong]), SPLIT, seed=0)
+    metrics = support_point_metrics(
+        "sp-rule", with_points(batch, wrong, levered[wrong]), SPLIT, 0, **AT_CONTACT
+    )
     assert set(metrics) == {"accuracy", "accuracy_from_mask", "accuracy_balanced"} | {
         f"accuracy_{n}" for n in range(3, 11)
     }
@@ -57,31 +54,33 @@ def test_chance_draws_an_edge_but_the_levered_one(batch):
 
 
 def test_what_was_not_observed_is_left_out(batch):
-    metrics = support_point_metrics("sp-rule", with_points(batch, SPLIT.test[:30], np.nan), SPLIT, seed=0)
+    metrics = support_point_metrics(
+        "sp-rule", with_points(batch, SPLIT.test[:30], np.nan), SPLIT, 0, **AT_CONTACT
+    )
     assert metrics["accuracy"] == 1.0
     assert {name for name in metrics if name[-1].isdigit()} == {
         f"accuracy_{n}" for n in set(batch.num_corners[SPLIT.test[30:]].tolist())
     }
 
 
-def test_predictions_are_learned_from_the_training_part_alone(batch, quick):
-    metrics = support_point_metrics("sp-pred", batch, SPLIT, seed=0)
+def test_predictions_are_learned_from_the_training_part_alone(batch):
+    metrics = support_point_metrics("sp-pred", batch, SPLIT, 0, **QUICK)
     assert metrics["accuracy"] > support_point_metrics("chance", batch, SPLIT, seed=0)["accuracy"]
     elsewhere = with_points(batch, SPLIT.test[20:], np.nan)
-    less = support_point_metrics("sp-pred", elsewhere, replace(SPLIT, test=SPLIT.test[:20]), seed=0)
-    more = support_point_metrics("sp-pred", batch, replace(SPLIT, test=SPLIT.test[:20]), seed=0)
+    less = support_point_metrics("sp-pred", elsewhere, replace(SPLIT, test=SPLIT.test[:20]), 0, **QUICK)
+    more = support_point_metrics("sp-pred", batch, replace(SPLIT, test=SPLIT.test[:20]), 0, **QUICK)
     assert less == more
     shifted = with_points(batch, SPLIT.train, batch.support_points[SPLIT.train] + 0.03)
-    assert support_point_metrics("sp-pred", shifted, SPLIT, seed=0) != metrics
+    assert support_point_metrics("sp-pred", shifted, SPLIT, 0, **QUICK) != metrics
 
 
-def test_the_same_seed_gives_the_same_numbers_and_leaves_torch_alone(batch, quick):
+def test_the_same_seed_gives_the_same_numbers_and_leaves_torch_alone(batch):
     state = torch.random.get_rng_state()
-    one = support_point_metrics("sp-pred", batch, SPLIT, seed=0)
+    one = support_point_metrics("sp-pred", batch, SPLIT, 0, **QUICK)
     assert torch.equal(state, torch.random.get_rng_state())
     torch.manual_seed(99)
-    assert support_point_metrics("sp-pred", batch, SPLIT, seed=0) == one
-    assert support_point_metrics("sp-pred", batch, SPLIT, seed=1) != one
+    assert support_point_metrics("sp-pred", batch, SPLIT, 0, **QUICK) == one
+    assert support_point_metrics("sp-pred", batch, SPLIT, 1, **QUICK) != one
 
 
 def test_unknown_features_are_refused_with_the_choices(batch):

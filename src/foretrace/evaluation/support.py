@@ -1,5 +1,6 @@
 """How often support corners are named right before the action: predicted, by rule, by chance (paper, section 5.1)."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -7,13 +8,12 @@ import torch
 from jaxtyping import Float
 
 from foretrace.errors import TrainingError
-from foretrace.features import FitPart, make_features
+from foretrace.features import FeatureExtractor, FitPart, Option, make_features
 from foretrace.features.support_points import (
     hull_and_com,
     named_right,
     order_points,
     points_of,
-    support_points_by_rule,
 )
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import Split
@@ -23,7 +23,7 @@ CHOICES = ("sp-pred", "sp-rule", "chance")
 
 
 def support_point_metrics(
-    features: str, batch: InteractionBatch, split: Split, seed: int
+    features: str, batch: InteractionBatch, split: Split, seed: int, **options: Option
 ) -> dict[str, float]:
     """Share of a test part's interactions of which both support corners are named right.
 
@@ -37,6 +37,7 @@ def support_point_metrics(
         batch: Interactions, those without observed support points are left out.
         split: Which of them are for training, validation and test.
         seed: Seed of the fit. PyTorch's own random state stays as it was.
+        **options: Settings of the feature extractor.
 
     Returns:
         ``accuracy``: with the object's corners; ``accuracy_3`` and so on: for objects of so many corners;
@@ -55,11 +56,14 @@ def support_point_metrics(
             f"none of the {len(split.test)} test interactions has observed support points: add levered ones"
         )
     seen = replace(test, corners=np.full_like(test.corners, np.nan))
-    if features == "sp-pred":
-        right, right_from_mask = _of_prediction(batch, split, seed, test, seen)
+    if features == "chance":
+        right, right_from_mask = _chances(test, test), _chances(seen, test)
     else:
-        judge = _of_rule if features == "sp-rule" else _of_chance
-        right, right_from_mask = judge(test, test), judge(seen, test)
+        extractor = _fitted(features, batch, split, seed, options)
+        right, right_from_mask = (
+            named_right(points_of(extractor(extractor.inputs(known))), test.corners, test.support_points)
+            for known in (test, seen)
+        )
     counts = np.unique(test.num_corners).tolist()
     by_count = {f"accuracy_{n}": float(right[test.num_corners == n].mean()) for n in counts}
     return {
@@ -70,28 +74,20 @@ def support_point_metrics(
     }
 
 
-def _of_prediction(
-    batch: InteractionBatch, split: Split, seed: int, *tests: InteractionBatch
-) -> list[Float[np.ndarray, " test"]]:
-    """Where a network fitted to the training part is right (1) or wrong (0), for each view of the test part."""
+def _fitted(
+    features: str, batch: InteractionBatch, split: Split, seed: int, options: Mapping[str, Option]
+) -> FeatureExtractor:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        extractor = make_features("sp-pred")
+        extractor = make_features(features, **options)
         train, validation = (
             FitPart(extractor.inputs(part), part) for part in (batch[split.train], batch[split.validation])
         )
         extractor.fit(train, validation, seed=seed, report=lambda line: None)
-    truth = tests[0]
-    predicted = [points_of(extractor(extractor.inputs(test))) for test in tests]
-    return [named_right(points, truth.corners, truth.support_points).astype(float) for points in predicted]
+    return extractor
 
 
-def _of_rule(known: InteractionBatch, truth: InteractionBatch) -> Float[np.ndarray, " test"]:
-    """Where the closed form is right (1) or wrong (0)."""
-    return named_right(support_points_by_rule(known), truth.corners, truth.support_points).astype(float)
-
-
-def _of_chance(known: InteractionBatch, truth: InteractionBatch) -> Float[np.ndarray, " test"]:
+def _chances(known: InteractionBatch, truth: InteractionBatch) -> Float[np.ndarray, " test"]:
     """How probably an edge drawn at random is the right one, the levered one excluded."""
     chances = np.zeros(len(truth))
     for row in range(len(truth)):
