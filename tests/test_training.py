@@ -17,12 +17,12 @@ from safetensors.torch import load_file
 from factories import QUICK_OPTIONS, fake_batch
 from foretrace.errors import CheckpointError, TrainingError
 from foretrace.evaluation.experiments import evaluate_predictor
-from foretrace.features import FEATURES, NoFeatures
+from foretrace.features import FEATURES, Autoencoder256, NoFeatures
 from foretrace.interactions.splits import Split
 from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
 from foretrace.predictor import training as training_module
 from foretrace.predictor.run_folder import RunFolder
-from foretrace.predictor.training import learning_rate, parameter_groups
+from foretrace.predictor.training import fit_predictor, learning_rate, parameter_groups
 from foretrace.trajectories import mean_distance
 
 SMALL = TrainConfig(features="none", hidden=16, epochs=3, min_steps=1, split=None, window=6, device="cpu")
@@ -346,6 +346,44 @@ def test_features_that_do_not_train_are_computed_once(tmp_path, batch, monkeypat
     monkeypatch.setitem(FEATURES, "counted", Counted)
     train(batch, replace(SMALL, features="counted"), tmp_path / "run")
     assert len(calls) == 2  # the training part and the validation part
+
+
+def halves(batch) -> Split:
+    return Split(np.arange(20), np.arange(20, 25), np.arange(25, 30))
+
+
+def test_training_in_memory_ends_with_the_model_of_the_folder(tmp_path, batch):
+    run = train(batch, SMALL, tmp_path / "run", split=halves(batch))
+    inputs = NoFeatures().inputs(batch)
+    predictor, progress = fit_predictor(batch, SMALL, halves(batch), inputs=inputs)
+    kept = load_file(run / "model.safetensors")
+    assert all(torch.equal(kept[name], tensor) for name, tensor in predictor.state_dict().items())
+    assert not predictor.training
+    assert [str(row["epoch"]) for row in progress.history] == [row["epoch"] for row in rows(run)]
+
+
+def test_what_features_learned_is_learned_once(tmp_path, batch, monkeypatch):
+    config = replace(SMALL, features="ae-256", feature_options=QUICK_OPTIONS["ae-256"], epochs=1)
+    calls = []
+    fit = Autoencoder256.fit
+
+    def counted(self, *parts, **more):
+        calls.append(1)
+        fit(self, *parts, **more)
+
+    monkeypatch.setattr(Autoencoder256, "fit", counted)
+    first, _ = fit_predictor(batch, config, halves(batch), fitted=tmp_path)
+    again, _ = fit_predictor(batch, config, halves(batch), fitted=tmp_path)
+    assert len(calls) == 1
+    assert all(torch.equal(first.state_dict()[name], tensor) for name, tensor in again.state_dict().items())
+    other = replace(halves(batch), train=np.arange(19))
+    fit_predictor(batch, config, other, fitted=tmp_path)
+    fit_predictor(batch, replace(config, seed=1), halves(batch), fitted=tmp_path)
+    assert len(calls) == 3
+    for file in tmp_path.glob("ae-256-*.safetensors"):
+        file.write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        fit_predictor(batch, config, halves(batch), fitted=tmp_path)
 
 
 def test_four_interactions_are_learned_by_heart(tmp_path):

@@ -20,7 +20,7 @@ import torch
 import foretrace
 from foretrace.errors import DatasetError, ResultsError
 from foretrace.interactions.storage import sole_writer, write_atomically
-from foretrace.predictor.run_folder import _git_commit
+from foretrace.predictor.run_folder import git_commit
 
 FORMAT = "foretrace-results"
 FORMAT_VERSION = 1
@@ -188,7 +188,7 @@ def describe_machine(device: str, workers: int, threads: int) -> dict[str, Any]:
         "workers": workers,
         "threads": threads,
         "torch": torch.__version__,
-        "commit": _git_commit(),
+        "commit": git_commit(),
     }
 
 

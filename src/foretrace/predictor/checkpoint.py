@@ -68,10 +68,7 @@ def load_predictor(path: str | Path) -> EffectPredictor:
         raise CheckpointError(
             f"{model} is missing: the training has not finished an epoch yet, or the copy is partial"
         )
-    try:
-        tensors = load_file(model)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{model} cannot be read ({error}): copy it again or train anew") from error
+    tensors = read_tensors(model)
     # Its first weights are drawn only to be replaced: the caller's random numbers must not notice.
     with torch.random.fork_rng(devices=[]):
         predictor = _make(config, path / CONFIG)
@@ -102,6 +99,20 @@ def read_config(path: Path) -> dict[str, Any]:
             "use the foretrace that wrote it, or train anew"
         )
     return config
+
+
+def read_tensors(file: Path) -> dict[str, Tensor]:
+    """The tensors of a safetensors file.
+
+    Raises:
+        CheckpointError: It is damaged.
+    """
+    try:
+        return load_file(file)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(
+            f"{file} cannot be read ({error}): remove it, copy it again or train anew"
+        ) from error
 
 
 def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -> None:

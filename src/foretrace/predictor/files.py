@@ -24,7 +24,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Write a safetensors file atomically."""
-    partial = path.with_name(path.name + ".partial")
+    # Several processes may write the same file at once.
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     save_file(
         {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, partial, metadata
     )

@@ -111,7 +111,7 @@ class RunFolder:
 
     def write_environment(self, facts: Mapping[str, Any]) -> None:
         """Note what the training runs on."""
-        write_json(self.path / ENVIRONMENT, {**facts, "commit": _git_commit(), "versions": _versions()})
+        write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": _versions()})
 
     def write_split(self, batch: InteractionBatch, split: Split) -> None:
         """Note the ids of the interactions in each part, and what they were."""
@@ -237,7 +237,7 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _git_commit() -> str | None:
+def git_commit() -> str | None:
     """Commit of the checkout that this code lies in, if it lies in one."""
     try:
         found = subprocess.run(

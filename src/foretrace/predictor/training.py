@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from foretrace.errors import TrainingError
@@ -24,7 +23,7 @@ from foretrace.features.fitting import learning_rate
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.checkpoint import load_tensors
+from foretrace.predictor.checkpoint import load_tensors, read_tensors
 from foretrace.predictor.files import write_tensors
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
@@ -288,7 +287,7 @@ class _Training:
             )
         file = self.fitted / f"{features.label}-{digest.hexdigest()[:16]}.safetensors"
         if file.is_file():
-            load_tensors(features, load_file(file), file)
+            load_tensors(features, read_tensors(file), file)
         else:
             features.fit(train, validation, seed=seed, report=report)
             self.fitted.mkdir(parents=True, exist_ok=True)
