@@ -13,6 +13,7 @@ from foretrace.errors import TrainingError
 from foretrace.features import FEATURES, FitPart, ImageCnn, make_features
 from foretrace.features import base as base_module
 from foretrace.features.base import fast_precision
+from foretrace.features.windows import convolve_windows
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
 
@@ -132,10 +133,14 @@ def test_the_cnn_is_the_papers_stack(batch):
     extractor = fitted("im-cnn").eval()
     shapes = [tuple(p.shape) for name, p in extractor.stack.named_parameters() if name.endswith("weight")]
     assert shapes == [(32, 1, 3, 3), (64, 32, 3, 3), (128, 64, 3, 3), (256, 128, 3, 3)]
-    x = extractor.inputs(batch).float().contiguous()
-    for convolution in extractor.stack.convolutions:  # written as the paper says it: ReLU, then pooling
-        weight = convolution.weight.detach().contiguous()
-        x = F.max_pool2d(F.relu(F.conv2d(x, weight, convolution.bias, padding=1)), 2)
+
+    def stack(x):
+        for convolution in extractor.stack.convolutions:  # written as the paper says it: ReLU, then pooling
+            weight = convolution.weight.detach().contiguous()
+            x = F.max_pool2d(F.relu(F.conv2d(x.contiguous(), weight, convolution.bias, padding=1)), 2)
+        return x
+
+    x = convolve_windows(extractor.inputs(batch), stack, channels=256)
     assert x.shape == (len(batch), 256, 8, 8)
     expected = F.relu(F.linear(x.flatten(1), extractor.dense.weight, extractor.dense.bias))
     torch.testing.assert_close(extractor(extractor.inputs(batch)), expected, rtol=1e-4, atol=1e-5)
