@@ -11,6 +11,8 @@ $(STAMP): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,docs,video]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --only-binary :all: pybullet \
+		|| echo "no pybullet for this Python: without Bullet, its tests are skipped"
 	touch $(STAMP)
 
 demo: setup

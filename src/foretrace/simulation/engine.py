@@ -7,9 +7,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from foretrace.actions import LeverUp, ToolPath
+from foretrace.geometry import pose_to_matrix
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation.tool import Tool
+
+SPEED_LIMIT = 60.0
+"""An object faster than this [m/s or rad/s] has been thrown by a numerical blow-up, not by a slow blade."""
+STANDING_DEPTH = 2e-4
+"""A contact of object and table counts while they are closer than this [m]."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +45,18 @@ class Engine(Protocol):
     """Plays lever-ups. Implementations are deterministic: equal arguments give equal motions."""
 
     name: str
+    library: str
+    """Distribution whose version shapes the numbers."""
 
     def play(self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics) -> Motion:
         """Plays one lever-up from the moment before the blade moves until the end of the path."""
         ...
+
+
+def tip_transforms(path: ToolPath, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4 4"]:
+    """Planned blade tip in the action frame: x along the blade, y to the left, z out of its upper face."""
+    x, z, pitch = path.at(times).T
+    pose = np.zeros((len(times), 7))
+    pose[:, 0], pose[:, 2] = x, z
+    pose[:, 3], pose[:, 5] = np.cos(pitch / 2), np.sin(pitch / 2)
+    return pose_to_matrix(pose)

@@ -17,7 +17,7 @@ from foretrace.simulation.engine import Engine, Motion
 from foretrace.simulation.tool import Tool
 
 CAMERAS = ("exact", "rgbd")
-ENGINES = ("mujoco",)
+ENGINES = ("mujoco", "bullet")
 LIFTED_TILT = np.deg2rad(3.0)
 """An object tilted by more than this counts as lifted [rad]."""
 OFF_SAMPLES = 2
@@ -47,6 +47,10 @@ def make_engine(name: str, embodiment: str, timestep: float, sample_period: floa
         from foretrace.simulation.mujoco_engine import MujocoEngine
 
         return MujocoEngine(embodiment, timestep, sample_period)
+    if name == "bullet":
+        from foretrace.simulation.bullet_engine import BulletEngine
+
+        return BulletEngine(embodiment, timestep, sample_period)
     raise SimulationError(f"engine {name!r} is unknown: choose one of {', '.join(ENGINES)}")
 
 
@@ -123,7 +127,7 @@ def simulate_lever_up(
             engine=engine.name,
             embodiment=config.embodiment,
             seed=seed,
-            versions=_versions(engine.name),
+            versions=_versions(engine.library),
         ),
         id=id,
     )
@@ -255,5 +259,5 @@ def _corner_counts(
 
 
 @lru_cache(maxsize=4)
-def _versions(engine: str) -> dict[str, str]:
-    return {name: version(name) for name in ("foretrace", "numpy", engine)}
+def _versions(library: str) -> dict[str, str]:
+    return {name: version(name) for name in ("foretrace", "numpy", library)}

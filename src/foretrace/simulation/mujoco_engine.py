@@ -17,19 +17,15 @@ from mujoco import rollout
 
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import SimulationError
-from foretrace.geometry import matrix_to_pose, pose_to_matrix
+from foretrace.geometry import matrix_to_pose
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation import arm
-from foretrace.simulation.engine import Motion
+from foretrace.simulation.engine import SPEED_LIMIT, STANDING_DEPTH, Motion, tip_transforms
 from foretrace.simulation.scene import EMBODIMENTS, build_scene
 from foretrace.simulation.tool import CARRIAGE_FREQUENCY, CARRIAGE_JOINTS, Tool
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
-SPEED_LIMIT = 20.0
-"""An object faster than this [m/s or rad/s] has been thrown by a numerical blow-up, not by a slow blade."""
-STANDING_DEPTH = 2e-4
-"""A contact of object and table counts while they are closer than this [m]."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ class MujocoEngine:
         SimulationError: If a value does not fit.
     """
 
-    name = "mujoco"
+    name = library = "mujoco"
 
     def __init__(self, embodiment: str = "arm", timestep: float = 0.002, sample_period: float = 0.05) -> None:
         if embodiment not in EMBODIMENTS:
@@ -187,12 +183,3 @@ def plan_control(
         setpoints[i] = position - (data.qfrc_inverse - servo[:, 2] * velocity) / servo[:, 1]
     start = arm.solve_inverse_kinematics(model, tips[0], joint_path.positions[0])
     return ControlPath(start, np.repeat(setpoints[1:], steps_per_tick, axis=0)[:num_steps], tips)
-
-
-def tip_transforms(path: ToolPath, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4 4"]:
-    """Planned blade tip in the action frame: x along the blade, y to the left, z out of its upper face."""
-    x, z, pitch = path.at(times).T
-    pose = np.zeros((len(times), 7))
-    pose[:, 0], pose[:, 2] = x, z
-    pose[:, 3], pose[:, 5] = np.cos(pitch / 2), np.sin(pitch / 2)
-    return pose_to_matrix(pose)

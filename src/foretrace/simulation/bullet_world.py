@@ -1,0 +1,268 @@
+"""Bodies in Bullet, the paper's physics engine: table, objects and screwdriver.
+
+Bullet puts a body's frame at its centre of mass, along its principal axes, and multiplies the friction coefficients
+of two surfaces. Objects therefore have friction 1, and table and blade the coefficient of their pair.
+"""
+
+import os
+import sys
+import tempfile
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from foretrace.errors import SimulationError
+from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
+from foretrace.objects import CollisionShape, CylinderShape, HullShape
+from foretrace.simulation.free_motion import Body
+from foretrace.simulation.scene import TABLE_HEIGHT, TABLE_SIZE, TABLE_THICKNESS
+from foretrace.simulation.tool import Tool
+
+COLLISION_MARGIN = 2e-5
+"""Bullet rounds shapes by this radius, so an object rests so far above the table [m]."""
+SOLVER_ITERATIONS = 50
+CONTACT_BREAKING = 0.001
+"""Bullet forgets contacts that open by more than this [m]."""
+BOUNCE_SPEED = 0.01
+"""Slower impacts do not bounce [m/s]."""
+TOOL_MASS = 1e6
+"""So heavy that no object disturbs the blade's path [kg, kg m^2]."""
+CONVEX_TOLERANCE = 1e-6
+"""Pieces whose hull has no more than their volume, to this share, are one convex body."""
+
+
+class Client:
+    """The library's functions, each with the number of one connection."""
+
+    def __init__(self, library: Any) -> None:
+        self._library, self._number = library, library.connect(library.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._library, name)
+        return partial(value, physicsClientId=self._number) if callable(value) else value
+
+
+@lru_cache(maxsize=1)
+def connect() -> Client:
+    """This process's Bullet, without a window; one for all simulations, as connecting takes longer than they do.
+
+    Raises:
+        SimulationError: If pybullet is not installed.
+    """
+    sys.stderr.flush()
+    # On import pybullet announces its date of birth on standard error, from C.
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        import pybullet
+    except ImportError as error:
+        raise SimulationError(
+            "engine 'bullet' needs the library pybullet: pip install 'foretrace[bullet]'"
+        ) from error
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+    return Client(pybullet)
+
+
+class World:
+    """An empty Bullet world, as good as new: equal calls give equal numbers.
+
+    Args:
+        timestep: Time step [s].
+        gravity: Gravity [m/s^2].
+
+    Raises:
+        SimulationError: If pybullet is not installed.
+    """
+
+    def __init__(self, timestep: float, gravity: tuple[float, float, float]) -> None:
+        self.bullet = connect()
+        self.timestep, self.gravity = timestep, gravity
+        self._frames: dict[int, Float[np.ndarray, "4 4"]] = {}
+        self.bullet.resetSimulation()
+        self.bullet.setPhysicsEngineParameter(
+            fixedTimeStep=timestep,
+            numSubSteps=0,
+            numSolverIterations=SOLVER_ITERATIONS,
+            solverResidualThreshold=0.0,  # always all iterations
+            deterministicOverlappingPairs=1,
+            contactBreakingThreshold=CONTACT_BREAKING,
+            restitutionVelocityThreshold=BOUNCE_SPEED,
+            enableFileCaching=0,
+        )
+        self.bullet.setGravity(*gravity)
+
+    def add_table(
+        self, friction: float, rolling_friction: float = 0.0, edge: float | None = None
+    ) -> tuple[int, ...]:
+        """A table, endless or with a far edge above a floor.
+
+        Args:
+            friction: Friction coefficient between it and objects.
+            rolling_friction: Lever arm of its resistance to rolling [m].
+            edge: Distance of its far edge [m]; None for an endless one.
+
+        Returns:
+            Number of the table, and of the floor if there is one.
+        """
+        b = self.bullet
+        plane = b.createCollisionShape(b.GEOM_PLANE, planeNormal=[0, 0, 1])
+        if edge is None:
+            bodies = (b.createMultiBody(0, plane),)
+        else:
+            half = [(TABLE_SIZE[0] + edge) / 2, TABLE_SIZE[1], TABLE_THICKNESS / 2]
+            board = b.createCollisionShape(b.GEOM_BOX, halfExtents=half)
+            table = b.createMultiBody(0, board, basePosition=[edge - half[0], 0, -half[2]])
+            bodies = (table, b.createMultiBody(0, plane, basePosition=[0, 0, -TABLE_HEIGHT]))
+        for body in bodies:
+            self._surface(body, friction, rolling_friction)
+        return bodies
+
+    def add_object(
+        self, body: Body, T_world_object: Float[np.ndarray, "4 4"], restitution: float = 0.0
+    ) -> int:
+        """A free body.
+
+        Returns:
+            Its number.
+
+        Raises:
+            SimulationError: If Bullet cannot build its shape.
+        """
+        inertia, axes = np.linalg.eigh(body.mass.inertia)
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        frame = np.eye(4)
+        frame[:3, :3], frame[:3, 3] = axes, body.mass.com
+        pose = matrix_to_pose(T_world_object @ frame)
+        number = self.bullet.createMultiBody(
+            body.mass.mass,
+            self._shape(body.shapes, invert_transform(frame)),
+            basePosition=pose[:3].tolist(),
+            baseOrientation=pose[[4, 5, 6, 3]].tolist(),
+        )
+        self._surface(number, 1.0)
+        self.bullet.changeDynamics(number, -1, localInertiaDiagonal=inertia.tolist(), restitution=restitution)
+        self._frames[number] = invert_transform(frame)
+        return number
+
+    def add_tool(self, tool: Tool, friction: float, not_against: tuple[int, ...]) -> int:
+        """Blade, shaft and handle as one heavy body whose frame is the blade's tip.
+
+        Args:
+            tool: Dimensions.
+            friction: Friction coefficient between it and objects.
+            not_against: Bodies that it passes through.
+
+        Returns:
+            Its number.
+        """
+        b = self.bullet
+        start, end = -tool.blade_length - tool.shaft_radius, -tool.length
+        middle = -tool.blade_length - 0.5 * (tool.length - tool.blade_length)
+        half = [tool.blade_length / 2, tool.blade_width / 2, tool.blade_thickness / 2]
+        along = [0, float(np.sqrt(0.5)), 0, float(np.sqrt(0.5))]
+        shape = b.createCollisionShapeArray(
+            shapeTypes=[b.GEOM_BOX, b.GEOM_CAPSULE, b.GEOM_CAPSULE],
+            halfExtents=[half, [0, 0, 0], [0, 0, 0]],
+            radii=[0, tool.shaft_radius, 0.012],
+            lengths=[0, start - middle, middle - end],
+            collisionFramePositions=[
+                [-half[0], 0, half[2]],
+                [(start + middle) / 2, 0, tool.shaft_radius],
+                [(middle + end) / 2, 0, tool.shaft_radius],
+            ],
+            collisionFrameOrientations=[[0, 0, 0, 1], along, along],
+        )
+        number = b.createMultiBody(TOOL_MASS, shape)
+        self._surface(number, friction)
+        b.changeDynamics(number, -1, localInertiaDiagonal=[TOOL_MASS] * 3)
+        for other in not_against:
+            b.setCollisionFilterPair(other, number, -1, -1, 0)
+        self._frames[number] = np.eye(4)
+        return number
+
+    def centred_pose(self, body: int) -> list[float]:
+        """Pose of a body's principal axes in its centre of mass, as `to_object_frame` takes it."""
+        position, (x, y, z, w) = self.bullet.getBasePositionAndOrientation(body)
+        return [*position, w, x, y, z]
+
+    def to_object_frame(self, body: int, poses: list[list[float]]) -> Float[np.ndarray, "time 7"]:
+        """Poses of a body's own frame: position [m], quaternion (w, x, y, z)."""
+        return matrix_to_pose(pose_to_matrix(np.array(poses)) @ self._frames[body])
+
+    def pose(self, body: int) -> Float[np.ndarray, " 7"]:
+        """Pose of a body's own frame now: position [m], quaternion (w, x, y, z)."""
+        return self.to_object_frame(body, [self.centred_pose(body)])[0]
+
+    def velocity(self, body: int) -> Float[np.ndarray, " 6"]:
+        """Velocity of the centre of mass [m/s], and angular velocity [rad/s]."""
+        return np.concatenate(self.bullet.getBaseVelocity(body))
+
+    def set_velocity(self, body: int, velocity: Float[np.ndarray, " 6"]) -> None:
+        """Sets velocity of the centre of mass [m/s] and angular velocity [rad/s]."""
+        self.bullet.resetBaseVelocity(body, velocity[:3].tolist(), velocity[3:].tolist())
+
+    def _surface(self, body: int, friction: float, rolling_friction: float = 0.0) -> None:
+        self.bullet.changeDynamics(
+            body,
+            -1,
+            lateralFriction=friction,
+            rollingFriction=rolling_friction,
+            spinningFriction=0.0,
+            restitution=1.0,
+            linearDamping=0.0,
+            angularDamping=0.0,
+            collisionMargin=COLLISION_MARGIN,
+        )
+
+    def _shape(self, shapes: tuple[CollisionShape, ...], T_body_object: Float[np.ndarray, "4 4"]) -> int:
+        """The collision shape of a body, in its own frame."""
+        b = self.bullet
+        hulls = [transform_points(T_body_object, s.vertices) for s in shapes if isinstance(s, HullShape)]
+        cylinders = [s for s in shapes if isinstance(s, CylinderShape)]
+        if (hulls and cylinders) or len(cylinders) > 1:
+            raise SimulationError(
+                "engine 'bullet' builds objects from convex pieces or from one cylinder alone"
+            )
+        if cylinders:
+            pose = matrix_to_pose(T_body_object @ cylinders[0].T_object_shape)
+            return b.createCollisionShape(
+                b.GEOM_CYLINDER,
+                radius=cylinders[0].radius,
+                height=cylinders[0].length,
+                collisionFramePosition=pose[:3].tolist(),
+                collisionFrameOrientation=pose[[4, 5, 6, 3]].tolist(),
+            )
+        together = _convex_union(hulls)
+        if together is not None:
+            return b.createCollisionShape(b.GEOM_MESH, vertices=together.tolist())
+        # Only a file can hold several hulls.
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "pieces.obj"
+            file.write_text(_wavefront(hulls), encoding="ascii")
+            return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
+
+
+def _convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:
+    """The corners of the pieces' union if it is convex: one hull has no seams for a blade to catch on."""
+    points = np.unique(np.concatenate(pieces), axis=0)
+    whole = ConvexHull(points)
+    volume = sum(ConvexHull(piece).volume for piece in pieces)
+    return points[whole.vertices] if whole.volume <= volume * (1 + CONVEX_TOLERANCE) else None
+
+
+def _wavefront(pieces: list[Float[np.ndarray, "_ 3"]]) -> str:
+    """The pieces' hulls as objects of one Wavefront OBJ file."""
+    lines, first = [], 1
+    for i, piece in enumerate(pieces):
+        lines.append(f"o piece_{i}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in piece]
+        lines += [f"f {a + first} {b + first} {c + first}" for a, b, c in ConvexHull(piece).simplices]
+        first += len(piece)
+    return "\n".join(lines) + "\n"

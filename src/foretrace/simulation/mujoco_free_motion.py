@@ -1,0 +1,95 @@
+"""Free motion in MuJoCo, on the table of the lever-ups."""
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from mujoco import rollout
+
+from foretrace.geometry import matrix_to_pose, quaternion_to_matrix
+from foretrace.interactions.record import Physics
+from foretrace.objects import HullShape
+from foretrace.simulation.free_motion import Body, Surroundings
+from foretrace.simulation.scene import build_scene
+from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, Tool
+
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+def play_freely(
+    body: Body,
+    pose: Float[np.ndarray, " 7"],
+    velocity: Float[np.ndarray, " 6"],
+    surroundings: Surroundings,
+    steps: int,
+    timestep: float,
+) -> tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]:
+    """Poses and velocities of a free body, as `simulate_free_motion` describes them."""
+    model = _compile(body, surroundings, timestep)
+    data = mujoco.MjData(model)
+    rotation, com = quaternion_to_matrix(pose[3:]), body.mass.com
+    # The free joint is at the centre of mass, in the object's directions.
+    data.qpos[:] = [*(pose[:3] + rotation @ com), *pose[3:]]
+    data.qvel[:] = [*velocity[:3], *(rotation.T @ velocity[3:])]
+    state = np.empty(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    states = state[None]
+    if steps:
+        later, _ = rollout.rollout(model, data, initial_state=state[None], nstep=steps)
+        states = np.vstack([states, np.asarray(later)[0]])
+    qpos, qvel = states[:, 1:8], states[:, 8:14]
+    rotations = quaternion_to_matrix(qpos[:, 3:])
+    positions = qpos[:, :3] - rotations @ com
+    spins = np.einsum("tij,tj->ti", rotations, qvel[:, 3:])
+    return np.hstack([positions, qpos[:, 3:]]), np.hstack([qvel[:, :3], spins])
+
+
+def _compile(body: Body, surroundings: Surroundings, timestep: float) -> mujoco.MjModel:
+    friction = [surroundings.friction, 0.005, surroundings.rolling_friction]
+    spec = build_scene(None, Physics(friction=surroundings.friction), Tool(), None, timestep)
+    spec.option.gravity = surroundings.gravity
+    table = spec.geom("table")
+    table.friction = friction
+    surface = {"friction": friction, "contype": OBJECT_BIT, "conaffinity": TABLE_BIT}
+    if surroundings.restitution is not None:
+        table.solref = surface["solref"] = _bouncing(surroundings.restitution, timestep)
+    part = spec.worldbody.add_body(name="object")
+    part.add_freejoint()
+    # Without a position MuJoCo drops the directions of the principal axes.
+    part.mass, part.ipos, part.explicitinertial = body.mass.mass, np.zeros(3), True
+    part.fullinertia = body.mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    for i, shape in enumerate(body.shapes):
+        if isinstance(shape, HullShape):
+            spec.add_mesh(name=f"piece_{i}", uservert=np.asarray(shape.vertices, dtype=np.float32).ravel())
+            kind = mujoco.mjtGeom.mjGEOM_MESH
+            part.add_geom(type=kind, meshname=f"piece_{i}", pos=-body.mass.com, **surface)
+        else:
+            place = matrix_to_pose(shape.T_object_shape)
+            part.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+                pos=place[:3] - body.mass.com,
+                quat=place[3:],
+                size=[shape.radius, shape.length / 2, 0.0],
+                condim=6 if surroundings.rolling_friction > 0 else 3,
+                **surface,
+            )
+    return spec.compile()
+
+
+def _bouncing(restitution: float, timestep: float) -> list[float]:
+    """Time constant [s] and damping ratio of contacts that return this share of an impact's speed.
+
+    MuJoCo has no coefficient of restitution: its contacts are a spring and a damper that push but never pull. They
+    are made as stiff as the time step bears.
+    """
+
+    def returned(damping: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        # A spring and damper that let go when their force vanishes (Schwager and Poeschel, 2007).
+        root = np.sqrt(1 - damping**2)
+        return np.exp(-damping / root * np.arctan2(2 * damping * root, 2 * damping**2 - 1))
+
+    dampings = np.linspace(1e-4, 0.9999, 10000)
+    damping = float(dampings[np.argmin(np.abs(returned(dampings) - restitution))])
+    return [2 * timestep / damping, damping]
