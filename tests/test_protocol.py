@@ -191,7 +191,13 @@ def test_seeds_draw_other_parts(paper_batch):
 def test_the_plan_is_the_papers():
     trials = plan()
     assert len(set(trials)) == len(trials)
-    per_seed = {"support-points": 18, "support-points-novel": 12, "features": 22, "half-plane": 3}
+    per_seed = {
+        "support-points": 18,
+        "support-points-novel": 12,
+        "support-points-plain": 2,
+        "features": 22,
+        "half-plane": 3,
+    }
     per_seed |= {"training-size": 66, "steps-ahead": 44, "novel-corners": 44}
     assert Counter(t.experiment for t in trials) == {name: 10 * count for name, count in per_seed.items()}
     assert {t.features for t in trials if t.experiment == "features"} == set(FEATURES)
@@ -236,6 +242,8 @@ def test_unknown_names_are_refused_with_the_choices(asked, message):
 
 
 def test_options_and_steps_reach_the_training():
+    plain = RECIPE.options(Trial("support-points-plain", "sp-pred", 0, "100"))
+    assert (plain["aligned"], plain["epochs"]) == (False, 500)
     half = RECIPE.configure(Trial("half-plane", "sc-800", 2, "shuffled"))
     assert (half.features, half.seed, half.feature_options, half.steps_ahead) == (
         "sc-800", 2, {"half_plane": True}, 1,
