@@ -21,6 +21,7 @@ from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
 from foretrace.cli.figures import figures
 from foretrace.cli.learning import predict, train
 from foretrace.cli.reconstruction import evaluate_reconstruction
+from foretrace.cli.replay import evaluate_replay
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -42,7 +43,12 @@ COMMANDS: dict[str, Command | Group] = {
     "train": train,
     "evaluate": Group(
         "Errors of one predictor, or the paper's comparisons of all of them.",
-        {"predictor": evaluate_predictor, "paper": evaluate_paper, "reconstruction": evaluate_reconstruction},
+        {
+            "predictor": evaluate_predictor,
+            "paper": evaluate_paper,
+            "reconstruction": evaluate_reconstruction,
+            "replay": evaluate_replay,
+        },
     ),
     "figures": figures,
     "predict": predict,

@@ -14,10 +14,12 @@ from scipy.spatial import ConvexHull, QhullError
 from foretrace.errors import SimulationError
 from foretrace.geometry import continuous_quaternions, quaternion_to_matrix
 from foretrace.objects import CollisionShape, CylinderShape, HullShape, MassProperties, ObjectModel
+from foretrace.objects.model import convex_mass_properties
 
 ENGINES = ("mujoco", "bullet")
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity on a level table [m/s^2]."""
+FLAT = "{} vertices enclose no volume: give at least four, not in one plane"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +42,7 @@ class Body:
             try:
                 ConvexHull(hull.vertices)
             except (QhullError, ValueError) as error:
-                raise SimulationError(
-                    f"{len(hull.vertices)} vertices enclose no volume: give at least four, not in one plane"
-                ) from error
+                raise SimulationError(FLAT.format(len(hull.vertices))) from error
 
     @classmethod
     def box(cls, size: Sequence[float], mass: float) -> "Body":
@@ -60,6 +60,16 @@ class Body:
         inertia = np.diag([across, across, mass * radius**2 / 2])
         shape = CylinderShape(float(radius), float(length), np.eye(4))
         return cls(MassProperties(float(mass), np.zeros(3), inertia), (shape,))
+
+    @classmethod
+    def hull(cls, vertices: Float[np.ndarray, "n 3"], mass: float) -> "Body":
+        """The convex hull of points [m], of uniform density and a mass [kg]."""
+        try:
+            corners = vertices[ConvexHull(vertices).vertices]
+        except (QhullError, ValueError, IndexError) as error:
+            raise SimulationError(FLAT.format(len(vertices))) from error
+        uniform = convex_mass_properties([corners], 1.0)
+        return cls(uniform.scaled(mass / uniform.mass), (HullShape(corners),))
 
     @classmethod
     def of(cls, obj: ObjectModel, density: float) -> "Body":
