@@ -1,7 +1,41 @@
-"""Distances between trajectories: full, final, rotation (paper, section 5.2)."""
+"""Distances between trajectories: full, final, rotation (paper, section 5.2), after time warping (5.4)."""
+
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from dtaidistance import dtw, dtw_ndim
+from jaxtyping import Float, Int
+
+
+class Alignment(NamedTuple):
+    """Two trajectories in step with each other."""
+
+    distance: float
+    """Mean Euclidean distance of the samples that belong together, in the trajectories' unit."""
+    path: Int[np.ndarray, "pairs 2"]
+    """Which sample of the first belongs to which of the second, from both beginnings to both ends."""
+
+
+def warped_distance(a: Float[np.ndarray, "time_a dims"], b: Float[np.ndarray, "time_b dims"]) -> Alignment:
+    """Distance of two trajectories whose samples were taken at other times (paper, section 5.4).
+
+    Dynamic time warping (Sakoe and Chiba, 1978), exact: of all monotone ways to pair the samples, that with the
+    least sum of Euclidean distances; its mean distance is what the paper calls the distance of trajectories.
+
+    Args:
+        a: Positions, one row per sample.
+        b: Positions, any number of samples, at any rate.
+
+    Raises:
+        ValueError: One of them is empty or has values that are not finite.
+    """
+    for name, values in (("first", a), ("second", b)):
+        if len(values) == 0 or not np.isfinite(values).all():
+            raise ValueError(f"the {name} trajectory has {len(values)} samples, all must be there and finite")
+    one, other = (np.ascontiguousarray(values, dtype=np.double) for values in (a, b))
+    costs = dtw_ndim.warping_paths_fast(one, other, inner_dist="euclidean")[1]
+    path = np.array(dtw.best_path(costs))
+    return Alignment(float(np.linalg.norm(one[path[:, 0]] - other[path[:, 1]], axis=1).mean()), path)
 
 
 def mean_distance(
