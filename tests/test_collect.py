@@ -21,6 +21,7 @@ from foretrace.interactions.record import Interaction, Outcome
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.recipes import num_corners
 
 SMALL = CollectConfig(objects=16)
 """208 trials: three shards."""
@@ -77,7 +78,7 @@ def reference(tmp_path_factory) -> Path:
 def test_the_papers_trials_are_2080():
     config = CollectConfig()
     assert num_trials(config) == 2080
-    counts = [collecting.num_corners(k) for k in range(config.objects)]
+    counts = [num_corners("paper", k) for k in range(config.objects)]
     assert [counts.count(n) for n in range(3, 11)] == [20] * 8
     located = [collecting._locate(config, id) for id in range(2080)]
     assert located == [(k, contact) for k in range(160) for contact in range(2 * counts[k])]
@@ -86,7 +87,7 @@ def test_the_papers_trials_are_2080():
 @pytest.mark.parametrize("objects", [1, 3, 8, 13])
 def test_any_number_of_objects_is_spread_over_the_corner_counts(objects):
     config = CollectConfig(objects=objects)
-    counts = [collecting.num_corners(k) for k in range(objects)]
+    counts = [num_corners("paper", k) for k in range(objects)]
     assert num_trials(config) == 2 * sum(counts)
     assert max(map(counts.count, counts)) - min(map(counts.count, counts)) <= 1
     obj, _, _ = trial(config, num_trials(config) - 1)

@@ -183,7 +183,10 @@ def synthetic_motion(
         ([0, 5, 20, 30, 40, 40], "110111", Outcome.LEVERED, None),
         ([0, 5, 20, 30, 10, 0], "111000", Outcome.SLIPPED, 3),
         ([0, 5, 20, 30, 40, 40], "111110", Outcome.SLIPPED, 5),
-        ([0, 5, 60, 95, 170, 180], "111000", Outcome.TUMBLED, 3),
+        ([0, 5, 60, 95, 170, 180], "111000", Outcome.TUMBLED, None),
+        ([0, 5, 40, 60, 85, 85], "111000", Outcome.TUMBLED, None),
+        ([0, 5, 40, 60, 85, 85], "111111", Outcome.LEVERED, None),
+        ([0, 5, 10, 15, 20, 25], "000000", Outcome.SLIPPED, 1),
     ],
 )
 def test_outcomes(angles: list[int], touches: str, outcome: Outcome, slip: int | None) -> None:

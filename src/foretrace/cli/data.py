@@ -8,6 +8,9 @@ from tyro.conf import Positional
 from foretrace.cli.console import say
 from foretrace.errors import DatasetError
 
+ROLLING_TIME = 1.5
+"""How long solids are watched after the blade has stopped [s]: most have rolled more than their length by then."""
+
 
 def simulate(
     out: Path,
@@ -18,6 +21,9 @@ def simulate(
     camera: Literal["exact", "rgbd"] = "exact",
     seed: int = 0,
     workers: int | None = None,
+    recipe: Literal["paper", "solids", "mixed"] = "paper",
+    watch_time: float | None = None,
+    table_edge: float | None = None,
 ) -> None:
     """Simulate lever-ups of many objects into a data set.
 
@@ -26,19 +32,34 @@ def simulate(
 
     Args:
         out: Folder of the data set.
-        objects: Number of objects, spread evenly over 3 to 10 corners.
+        objects: Number of objects; prisms are spread evenly over 3 to 10 corners.
         contacts_per_edge: Lever-ups at each edge of each object.
         engine: Physics engine.
         embodiment: The whole robot, or the blade alone on the same path (faster).
         camera: How the view from above is made: from geometry, or from a rendered depth image.
         seed: Seed of objects, contact points and simulations.
         workers: Processes; by default one for each core.
+        recipe: Which objects. paper: prisms. solids: lying cylinders, boxes and flat prisms, always three with one
+            outline. mixed: prisms and solids.
+        watch_time: Seconds to go on watching after the blade has stopped; by default 0 for the paper's prisms,
+            and 1.5 for solids, which may roll.
+        table_edge: Distance of the table's edge ahead of the contact point, in metres: objects can fall off. By
+            default no edge is within reach.
     """
+    from foretrace.interactions.record import Physics
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig
 
-    simulation = SimulationConfig(engine=engine, embodiment=embodiment, camera=camera)
-    config = CollectConfig(objects, contacts_per_edge, seed, simulation)
+    if watch_time is None:
+        watch_time = 0.0 if recipe == "paper" else ROLLING_TIME
+    simulation = SimulationConfig(
+        engine=engine,
+        embodiment=embodiment,
+        camera=camera,
+        watch_time=watch_time,
+        physics=Physics(table_edge=table_edge),
+    )
+    config = CollectConfig(objects, contacts_per_edge, seed, simulation, recipe)
     try:
         counts = collect(config, out, workers)
     except KeyboardInterrupt:

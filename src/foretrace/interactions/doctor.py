@@ -101,7 +101,11 @@ def _set_aside(path: Path, name: str, manifest: dict, problem: str, repair: bool
 
 def _unsound_numbers(name: str, table: pa.Table) -> Iterator[Finding]:
     """NaN, infinities, wrong lengths and quaternions that are no rotations."""
-    scalars = [f.name for f in storage.SCHEMA if pa.types.is_floating(f.type)]
+    scalars = [
+        f.name
+        for f in storage.SCHEMA
+        if pa.types.is_floating(f.type) and f.name not in storage.OPTIONAL_COLUMNS
+    ]
     columns = [*storage.TRAJECTORIES, "joint_trajectory", "num_joints", "id", "outcome", *scalars]
     for row in table.select(columns).to_pylist():
         who = f"interaction {row['id']}"

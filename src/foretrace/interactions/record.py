@@ -23,9 +23,9 @@ class Outcome(StrEnum):
     SLIPPED = "slipped"
     """Lifted, then lost from the blade before the path's end."""
     TUMBLED = "tumbled"
-    """Turned over its support edge, past the vertical."""
+    """Turned over its support edge, onto another side."""
     ROLLED = "rolled"
-    """Rolled away from the contact point instead of being lifted."""
+    """Rolled away instead of being lifted."""
     MISSED = "missed"
     """Never lifted: the blade passed beside or only pushed it."""
     FAILED = "failed"
@@ -53,7 +53,10 @@ class Effect:
     outcome: Outcome
     """What became of the object."""
     slip_index: int | None = None
-    """First sample at which the object was off the blade after having been lifted, or None."""
+    """First sample at which the object was off the blade after having been lifted, or None. An object that rolled or
+    tumbled has none: leaving the blade is what it did."""
+    fall_index: int | None = None
+    """First sample at which the object was falling off the table, or None; the record ends above the floor."""
     path_error: float = 0.0
     """Largest distance of the blade tip from its planned path [m]."""
 
@@ -68,6 +71,10 @@ class Physics:
     """Coulomb friction coefficient between object and table."""
     tool_friction: float = 0.3
     """Coulomb friction coefficient between object and blade."""
+    rolling_friction: float = 1e-4
+    """Lever arm of the table's resistance to rolling [m]; felt by round objects alone."""
+    table_edge: float | None = None
+    """Distance of the table's far edge ahead of the contact point [m]; None: no edge within reach."""
 
 
 @dataclass(frozen=True)

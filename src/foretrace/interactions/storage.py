@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "direction": (_FLOATS, "", "unit direction of the action in the object frame (2)"),
     "outcome": (pa.string(), "", "what became of the object"),
     "slip_index": (pa.int64(), "", "first sample off the blade after having been lifted, or null"),
+    "fall_index": (pa.int64(), "", "first sample falling off the table, or null"),
     "times": (_FLOATS, "s", "sample times"),
     "pose_trajectory": (_FLOATS, "m", "object frame: position, quaternion w x y z (time x 7)"),
     "com_trajectory": (_FLOATS, "m", "centre of mass (time x 3)"),
@@ -57,6 +58,8 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "density": (pa.float64(), "kg/m^3", "density of the object"),
     "friction": (pa.float64(), "", "friction coefficient between object and table"),
     "tool_friction": (pa.float64(), "", "friction coefficient between object and blade"),
+    "rolling_friction": (pa.float64(), "m", "lever arm of the resistance to rolling of a round object"),
+    "table_edge": (pa.float64(), "m", "distance of the table's edge ahead of the contact point, or null"),
     "source": (pa.string(), "", "simulated or recorded"),
     "engine": (pa.string(), "", "physics engine, empty for a recording"),
     "embodiment": (pa.string(), "", "arm or tool"),
@@ -64,6 +67,15 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "versions": (pa.string(), "", "versions that shaped the numbers, as JSON"),
 }
 """Every column: type, unit, meaning. Vectors are in the action frame unless their meaning says otherwise."""
+ADDED_COLUMNS: dict[str, Any] = {
+    "fall_index": None,
+    "rolling_friction": Physics.rolling_friction,
+    "table_edge": None,
+}
+"""Columns that older data sets lack, and what they would hold there."""
+OPTIONAL_COLUMNS = ("slip_index", "fall_index", "table_edge")
+"""Numbers that may be null."""
+PHYSICS_COLUMNS = tuple(field.name for field in fields(Physics))
 SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
 TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
 """Numbers per sample of each trajectory column; the joints' count is a column of its own."""
@@ -87,6 +99,7 @@ def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
         "direction": np.asarray(action.direction, dtype=float),
         "outcome": str(effect.outcome),
         "slip_index": effect.slip_index,
+        "fall_index": effect.fall_index,
         **{name: np.ravel(getattr(effect, name)[kept]) for name in (*TRAJECTORIES, "joint_trajectory")},
         "num_joints": effect.joint_trajectory.shape[1],
         "support_points": np.ravel(effect.support_points),
@@ -113,6 +126,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
         support_corners=tuple(row["support_corners"]),
         outcome=Outcome(row["outcome"]),
         slip_index=row["slip_index"],
+        fall_index=row["fall_index"],
         path_error=row["path_error"],
     )
     return Interaction(
@@ -124,7 +138,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
             metres_per_pixel=row["metres_per_pixel"],
         ),
         effect=effect,
-        physics=Physics(**{name: row[name] for name in ("density", "friction", "tool_friction")}),
+        physics=Physics(**{name: row[name] for name in PHYSICS_COLUMNS}),
         provenance=Provenance(
             **{name: row[name] for name in ("source", "engine", "embodiment", "seed")},
             versions=json.loads(row["versions"]),
@@ -227,11 +241,22 @@ def read_shard(folder: Path, name: str, sha256: str | None = None) -> tuple[pa.T
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error
+    table = _with_added_columns(table)
     if not table.schema.equals(SCHEMA):
         found, wanted = ({field.name: field.type for field in schema} for schema in (table.schema, SCHEMA))
         odd = ", ".join(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
         raise DatasetError(f"shard {path} has another schema (differs in {odd}); {remedy}")
     return table, content
+
+
+def _with_added_columns(table: pa.Table) -> pa.Table:
+    """A table of an older data set with the columns that have been added since, in today's order."""
+    for name, value in ADDED_COLUMNS.items():
+        if name not in table.column_names:
+            values = pa.array([value] * table.num_rows, type=SCHEMA.field(name).type)
+            table = table.append_column(SCHEMA.field(name), values)
+    known = set(table.column_names) == set(SCHEMA.names) and len(table.column_names) == len(SCHEMA)
+    return table.select(SCHEMA.names) if known else table
 
 
 def new_manifest(

@@ -1,12 +1,29 @@
-"""What an object is: an extruded outline or a closed mesh, and the paper's random object set."""
+"""What an object is: an extruded outline, a box, a lying cylinder or a closed mesh; and random sets of them."""
 
 from typing import Any
 
 from foretrace.errors import ShapeError
 from foretrace.objects.mesh import MeshObject
-from foretrace.objects.model import BEVEL, NO_BEVEL, Bevel, MassProperties, ObjectModel
+from foretrace.objects.model import (
+    BEVEL,
+    NO_BEVEL,
+    Bevel,
+    CollisionShape,
+    CylinderShape,
+    HullShape,
+    MassProperties,
+    ObjectModel,
+)
 from foretrace.objects.prism import CIRCLE_RADIUS, CORNER_COUNTS, Prism, paper_objects, sample_prism
 from foretrace.objects.silhouette import read_silhouette, silhouette_origin
+from foretrace.objects.solid import (
+    Box,
+    Cylinder,
+    look_alikes,
+    sample_box,
+    sample_cylinder,
+    sample_look_alikes,
+)
 
 __all__ = [
     "BEVEL",
@@ -14,18 +31,32 @@ __all__ = [
     "CORNER_COUNTS",
     "NO_BEVEL",
     "Bevel",
+    "Box",
+    "CollisionShape",
+    "Cylinder",
+    "CylinderShape",
+    "HullShape",
     "MassProperties",
     "MeshObject",
     "ObjectModel",
     "Prism",
+    "look_alikes",
     "object_from_dict",
     "paper_objects",
     "read_silhouette",
+    "sample_box",
+    "sample_cylinder",
+    "sample_look_alikes",
     "sample_prism",
     "silhouette_origin",
 ]
 
-KINDS: dict[str, type[Prism] | type[MeshObject]] = {"prism": Prism, "mesh": MeshObject}
+KINDS: dict[str, type[Prism] | type[Cylinder] | type[MeshObject]] = {
+    "prism": Prism,
+    "box": Box,
+    "cylinder": Cylinder,
+    "mesh": MeshObject,
+}
 """Objects by the name that ``to_dict`` gives them."""
 
 

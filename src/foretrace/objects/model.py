@@ -57,6 +57,30 @@ class MassProperties:
         return MassProperties(factor * self.mass, self.com, factor * self.inertia)
 
 
+@dataclass(frozen=True)
+class HullShape:
+    """A convex body given by points: the hull of its vertices."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    """Vertices in the object frame [m]."""
+
+
+@dataclass(frozen=True)
+class CylinderShape:
+    """A true cylinder, round to the last digit."""
+
+    radius: float
+    """Radius [m]."""
+    length: float
+    """Length [m]."""
+    T_object_shape: Float[np.ndarray, "4 4"]
+    """The cylinder's frame, origin in its middle and z along its axis -> object frame."""
+
+
+CollisionShape = HullShape | CylinderShape
+"""What a physics engine builds objects from, in terms that every engine knows."""
+
+
 class ObjectModel(ABC):
     """A rigid object of uniform density at rest on the table.
 
@@ -72,6 +96,15 @@ class ObjectModel(ABC):
     @abstractmethod
     def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:
         """Vertices of the convex parts that make up the object for collisions, in the object frame [m]."""
+
+    def collision_shapes(self) -> list[CollisionShape]:
+        """The object's parts as a physics engine should collide them: hulls, or true cylinders."""
+        return [HullShape(vertices) for vertices in self.convex_pieces()]
+
+    @property
+    def is_round(self) -> bool:
+        """Whether the object can roll, so that friction against rolling counts."""
+        return any(isinstance(shape, CylinderShape) for shape in self.collision_shapes())
 
     @property
     @abstractmethod

@@ -21,7 +21,7 @@ from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
-from foretrace.simulation.scene import build_scene
+from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.tool import Tool
 
 MINIMAL_HEIGHT = 0.008
@@ -81,7 +81,9 @@ def take_rgbd(
     model = spec.compile()
     model.cam_fovy[0] = np.rad2deg(2 * np.arctan(camera.height / 2 / camera.fy))
     data = mujoco.MjData(model)
-    data.qpos[:7] = matrix_to_pose(action.T_action_object)
+    T_object_body = np.eye(4)
+    T_object_body[:3, 3] = body_origin(obj)
+    data.qpos[:7] = matrix_to_pose(action.T_action_object @ T_object_body)
     mujoco.mj_forward(model, data)
     with make_renderer(model, camera.height, camera.width) as renderer:
         renderer.update_scene(data, camera="above")

@@ -1,6 +1,6 @@
 """Many lever-ups into one data set: in parallel, reproducibly, and so that no crash destroys what is done.
 
-The trials are the paper's (section 4): every object is levered at two points of each edge. Trial ``id`` of a
+Every object is levered at two points of each edge (paper, section 4); a recipe says which objects. Trial ``id`` of a
 configuration is always the same object, action and seed, whoever simulates it and in whatever order.
 """
 
@@ -9,6 +9,7 @@ import os
 import platform
 import signal
 import time
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -25,13 +26,14 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from foretrace.actions import LeverUp, sample_contacts
+from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, ForetraceError, SimulationError
 from foretrace.interactions import storage
-from foretrace.interactions.record import Interaction, Outcome
-from foretrace.objects import CORNER_COUNTS, ObjectModel, Prism, sample_prism
-from foretrace.simulation import lever_up
+from foretrace.interactions.record import Interaction, Outcome, Physics
+from foretrace.objects import ObjectModel
+from foretrace.simulation import lever_up, recipes
 from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.recipes import RECIPES
 
 SHARD_SIZE = 100
 """Interactions in one file."""
@@ -46,13 +48,15 @@ class CollectConfig:
     """Everything that decides what is in a data set."""
 
     objects: int = 160
-    """Number of objects, spread evenly over 3 to 10 corners; the paper has 160."""
+    """Number of objects; the paper has 160, spread evenly over 3 to 10 corners."""
     contacts_per_edge: int = 2
     """Lever-ups at each edge of each object."""
     seed: int = 0
     """Seed of the objects, the contact points and the simulations."""
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     """How each lever-up is simulated."""
+    recipe: str = "paper"
+    """Which objects: one of RECIPES."""
 
     def __post_init__(self) -> None:
         for name in ("objects", "contacts_per_edge"):
@@ -60,16 +64,22 @@ class CollectConfig:
                 raise SimulationError(f"{name} is {getattr(self, name)}, it must be at least 1")
         if self.seed < 0:
             raise SimulationError(f"seed is {self.seed}, it must not be negative")
+        if self.recipe not in RECIPES:
+            raise SimulationError(f"recipe {self.recipe!r} is unknown: choose one of {', '.join(RECIPES)}")
 
 
-def num_corners(object_index: int) -> int:
-    """Corners of an object: the counts take turns, so that any number of objects is spread evenly."""
-    return CORNER_COUNTS[object_index % len(CORNER_COUNTS)]
+SETTINGS_SINCE: dict[str, Any] = {
+    "recipe": "paper",
+    "simulation.watch_time": 0.0,
+    "simulation.physics.rolling_friction": Physics.rolling_friction,
+    "simulation.physics.table_edge": None,
+}
+"""Settings that older data sets do not name, and what they were in effect."""
 
 
 def num_trials(config: CollectConfig) -> int:
     """How many lever-ups the configuration asks for; 2080 for the paper's 160 objects."""
-    return config.contacts_per_edge * sum(num_corners(k) for k in range(config.objects))
+    return _first_contacts(config.recipe, config.objects, config.contacts_per_edge)[-1]
 
 
 def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, LeverUp, int]:
@@ -81,9 +91,9 @@ def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, LeverUp, int]:
     if not 0 <= id < num_trials(config):
         raise SimulationError(f"there is no trial {id}: this configuration has 0 to {num_trials(config) - 1}")
     object_index, contact_index = _locate(config, id)
-    prism, actions = _object_and_actions(config.seed, object_index, config.contacts_per_edge)
+    obj, actions = _object_and_actions(config.recipe, config.seed, object_index, config.contacts_per_edge)
     seed = np.random.SeedSequence([config.seed, object_index, contact_index]).generate_state(1)[0]
-    return prism, actions[contact_index], int(seed)
+    return obj, actions[contact_index], int(seed)
 
 
 def simulate_trial(config: CollectConfig, id: int) -> Interaction:
@@ -94,20 +104,13 @@ def simulate_trial(config: CollectConfig, id: int) -> Interaction:
 
 def _locate(config: CollectConfig, id: int) -> tuple[int, int]:
     """Which object a trial levers, and at which of its contact points."""
-    per_round = config.contacts_per_edge * sum(CORNER_COUNTS)
-    rounds, contact_index = divmod(id, per_round)
-    object_index = rounds * len(CORNER_COUNTS)
-    while contact_index >= config.contacts_per_edge * num_corners(object_index):
-        contact_index -= config.contacts_per_edge * num_corners(object_index)
-        object_index += 1
-    return object_index, contact_index
+    firsts = _first_contacts(config.recipe, config.objects, config.contacts_per_edge)
+    object_index = bisect_right(firsts, id) - 1
+    return object_index, id - firsts[object_index]
 
 
-@lru_cache(maxsize=64)
-def _object_and_actions(seed: int, object_index: int, contacts_per_edge: int) -> tuple[Prism, list[LeverUp]]:
-    rng = np.random.default_rng(np.random.SeedSequence([seed, object_index]))
-    prism = sample_prism(rng, num_corners(object_index))
-    return prism, sample_contacts(prism, rng, per_edge=contacts_per_edge)
+_first_contacts = lru_cache(maxsize=4)(recipes.first_contacts)
+_object_and_actions = lru_cache(maxsize=64)(recipes.object_and_actions)
 
 
 def collect(
@@ -167,7 +170,7 @@ def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[s
         storage.write_manifest(out, manifest)
         return manifest
     manifest = storage.read_manifest(out)
-    found = {**_flat(manifest["configuration"]), "shard_size": manifest["shard_size"]}
+    found = {**SETTINGS_SINCE, **_flat(manifest["configuration"]), "shard_size": manifest["shard_size"]}
     asked = {**_flat(wanted), "shard_size": SHARD_SIZE}
     for name in sorted(found.keys() | asked.keys()):
         if found.get(name) != asked.get(name):

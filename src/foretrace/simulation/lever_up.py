@@ -1,6 +1,6 @@
 """Play the action, judge and record the effect (paper, section 4)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
 
@@ -22,8 +22,14 @@ LIFTED_TILT = np.deg2rad(3.0)
 """An object tilted by more than this counts as lifted [rad]."""
 OFF_SAMPLES = 2
 """So many samples in a row off the blade are a slip; one alone is a bounce."""
-ROLLED_RISE = 0.25
-"""Rolling lifts the centre of mass by less than this part of its height at rest."""
+ROLLED_TURN = np.deg2rad(30.0)
+"""An object that turns by more than this about horizontal axes, its height unchanged, has rolled [rad]."""
+ROLLED_RISE = 0.05
+"""Rolling changes the height of the centre of mass by less than this part of its height at rest."""
+UPRIGHT_TILT = np.deg2rad(80.0)
+"""An object that rests, off the blade, with a larger tilt than this lies on another side [rad]."""
+FALL_DEPTH = 0.5
+"""The record of a falling object ends this far below the table top, above the floor [m]."""
 CORNER_REACH = 0.004
 """A table contact belongs to a corner within this distance [m]."""
 SUPPORT_SHARE = 0.5
@@ -70,12 +76,23 @@ class SimulationConfig:
     """Time between recorded samples [s]."""
     path: ToolPath = field(default_factory=ToolPath)
     """The blade's path."""
+    watch_time: float = 0.0
+    """How long the object is watched on after the path's end, while the blade stands still [s]."""
     tool: Tool = field(default_factory=Tool)
     """The screwdriver."""
     physics: Physics = field(default_factory=Physics)
     """Friction and density."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.watch_time <= 60:
+            raise SimulationError(f"watch_time = {self.watch_time} s is outside 0 to 60 s")
+        if self.physics.table_edge is not None and not 0 < self.physics.table_edge <= 10:
+            raise SimulationError(f"table_edge = {self.physics.table_edge} m: give a distance up to 10 m")
+        if not 0 <= self.physics.rolling_friction <= 0.1:
+            raise SimulationError(
+                f"rolling_friction = {self.physics.rolling_friction} m is outside 0 to 0.1 m: "
+                "it is a lever arm, a tenth of a millimetre on a hard table"
+            )
         make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
         if self.camera not in CAMERAS:
             raise SimulationError(f"camera {self.camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
@@ -115,7 +132,8 @@ def simulate_lever_up(
         from foretrace.simulation.camera import take_rgbd
 
         view = take_rgbd(obj, action, seed=seed).view()
-    motion = engine.play(obj, action, config.path, config.tool, config.physics)
+    path = replace(config.path, hold_time=config.path.hold_time + config.watch_time)
+    motion = engine.play(obj, action, path, config.tool, config.physics)
     return Interaction(
         object=obj,
         action=action,
@@ -143,6 +161,7 @@ def simulate(
     seed: int = 0,
     physics: Physics | None = None,
     path: ToolPath | None = None,
+    watch_time: float = 0.0,
 ) -> Interaction:
     """Simulates one lever-up; ``simulate_lever_up`` with the settings that people change spelled out.
 
@@ -155,6 +174,7 @@ def simulate(
         seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
         physics: Friction and density, if not the usual ones.
         path: The blade's path, if not the usual one.
+        watch_time: How long the object is watched on after the path's end [s].
 
     Raises:
         SimulationError: If engine, embodiment or camera is unknown.
@@ -167,6 +187,7 @@ def simulate(
         camera=camera,
         path=path or ToolPath(),
         physics=physics or Physics(),
+        watch_time=watch_time,
     )
     return simulate_lever_up(obj, action, config, seed=seed)
 
@@ -185,16 +206,18 @@ def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -
         empty = np.empty((0, 7))
         joints = np.empty((0, motion.joints.shape[1]))
         return Effect(np.empty(0), empty, np.empty((0, 3)), empty, joints, unknown, (), Outcome.FAILED)
-    com_in_object = obj.mass_properties(physics.density).com
+    motion, fall = _until_the_floor(motion, obj, physics)
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
-    com = motion.object_pose[:, :3] + rotation @ com_in_object
+    com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
     angle = tilt(rotation)
     lifted = angle > LIFTED_TILT
+    if obj.is_round:  # turning about its own axis is no lifting
+        lifted &= com[:, 2] > (1 + ROLLED_RISE) * com[0, 2]
     slip = _slip_index(lifted, motion.on_blade)
-    outcome = _outcome(angle, com[:, 2], slip)
+    outcome = _outcome(rotation, com[:, 2], lifted, bool(motion.on_blade[-1]), slip)
     corners, points = (), unknown
     end = len(com) if slip is None else slip
-    if lifted[:end].any():
+    if lifted[:end].any() and outcome != Outcome.ROLLED:
         counts = _corner_counts(motion, obj, np.flatnonzero(lifted[:end]))
         shares = counts / max(int(lifted[:end].sum()), 1)
         corners = tuple(int(k) for k in np.flatnonzero(shares >= SUPPORT_SHARE))
@@ -211,9 +234,24 @@ def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -
         support_points=points,
         support_corners=corners,
         outcome=outcome,
-        slip_index=slip,
+        slip_index=None if outcome in (Outcome.ROLLED, Outcome.TUMBLED) else slip,
+        fall_index=fall,
         path_error=motion.path_error,
     )
+
+
+def _until_the_floor(motion: Motion, obj: ObjectModel, physics: Physics) -> tuple[Motion, int | None]:
+    """The motion up to where a falling object nears the floor, and the first sample at which it falls."""
+    com = obj.mass_properties(physics.density).com
+    height = motion.object_pose[:, 2] + (quaternion_to_matrix(motion.object_pose[:, 3:]) @ com)[:, 2]
+    if physics.table_edge is None or (height > 0).all():
+        return motion, None
+    end = int((height < -FALL_DEPTH).argmax()) or len(height)
+    cut = {
+        name: getattr(motion, name)[:end]
+        for name in ("times", "object_pose", "tool_pose", "joints", "on_blade", "table_contacts")
+    }
+    return replace(motion, **cut), int((height <= 0).argmax())
 
 
 def _slip_index(lifted: Bool[np.ndarray, " time"], on_blade: Bool[np.ndarray, " time"]) -> int | None:
@@ -230,16 +268,32 @@ def _slip_index(lifted: Bool[np.ndarray, " time"], on_blade: Bool[np.ndarray, " 
 
 
 def _outcome(
-    angle: Float[np.ndarray, " time"], com_z: Float[np.ndarray, " time"], slip: int | None
+    rotation: Float[np.ndarray, "time 3 3"],
+    com_z: Float[np.ndarray, " time"],
+    lifted: Bool[np.ndarray, " time"],
+    on_blade_at_end: bool,
+    slip: int | None,
 ) -> Outcome:
-    rise = com_z.max() - com_z[0]
-    if angle.max() <= LIFTED_TILT:
-        return Outcome.MISSED
-    if angle.max() > np.pi / 4 and rise < ROLLED_RISE * com_z[0]:
+    angle = tilt(rotation)
+    if _rolling_turn(rotation, com_z) > ROLLED_TURN:
         return Outcome.ROLLED
-    if angle.max() > np.pi / 2:
+    if angle.max() > np.pi / 2 or (angle[-1] > UPRIGHT_TILT and not on_blade_at_end):
         return Outcome.TUMBLED
+    if not lifted.any():
+        return Outcome.MISSED
     return Outcome.LEVERED if slip is None else Outcome.SLIPPED
+
+
+def _rolling_turn(rotation: Float[np.ndarray, "time 3 3"], com_z: Float[np.ndarray, " time"]) -> float:
+    """Largest turn about horizontal axes within samples in a row at the height at rest [rad]."""
+    level = np.abs(com_z - com_z[0]) < ROLLED_RISE * com_z[0]
+    starts = np.flatnonzero(np.diff(level.astype(int), prepend=0) == 1)
+    stops = np.flatnonzero(np.diff(level.astype(int), append=0) == -1) + 1
+    turns = [
+        tilt(rotation[start:stop] @ rotation[start].T).max()
+        for start, stop in zip(starts, stops, strict=True)
+    ]
+    return float(max(turns))
 
 
 def _corner_counts(

@@ -22,7 +22,7 @@ from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation import arm
 from foretrace.simulation.engine import SPEED_LIMIT, STANDING_DEPTH, Motion, tip_transforms
-from foretrace.simulation.scene import EMBODIMENTS, build_scene
+from foretrace.simulation.scene import EMBODIMENTS, body_origin, build_scene
 from foretrace.simulation.tool import CARRIAGE_FREQUENCY, CARRIAGE_JOINTS, Tool
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -76,7 +76,9 @@ class MujocoEngine:
         control = plan_control(path, tool, self.embodiment, self.timestep, self.sample_period)
         model, data = self._compiled(obj, physics, tool)
         mujoco.mj_resetData(model, data)
-        data.qpos[:7] = matrix_to_pose(action.T_action_object)
+        T_object_body = np.eye(4)
+        T_object_body[:3, 3] = body_origin(obj)
+        data.qpos[:7] = matrix_to_pose(action.T_action_object @ T_object_body)
         data.qpos[7:] = control.start
         state = np.empty(mujoco.mj_stateSize(model, STATE))
         mujoco.mj_getState(model, data, state, STATE)
@@ -108,13 +110,15 @@ class MujocoEngine:
         # A comparison with NaN is false, so this finds both.
         diverged = not bool(np.all(np.abs(object_qvel) < SPEED_LIMIT))
         object_body, blade_body = model.body("object").id, model.body("blade").id
-        table, tip = model.geom("table").id, model.site("tip").id
+        table, tip, frame = model.geom("table").id, model.site("tip").id, model.site("object").id
+        object_pose = qpos[:, :7].copy()
         tool_pose, on_blade, contacts = np.zeros((num, 7)), np.zeros(num, dtype=bool), []
         for i in range(num if not diverged else 0):
             mujoco.mj_setState(model, data, samples[i], STATE)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_collision(model, data)
+            object_pose[i, :3] = data.site_xpos[frame]
             tool_pose[i, :3] = data.site_xpos[tip]
             mujoco.mju_mat2Quat(tool_pose[i, 3:], data.site_xmat[tip])
             geoms, contact = data.contact.geom, data.contact
@@ -123,11 +127,11 @@ class MujocoEngine:
             on_blade[i] = bool((on_object & (bodies == blade_body).any(axis=1)).any())
             standing = on_object & (geoms == table).any(axis=1) & (contact.dist < STANDING_DEPTH)
             rotation = data.xmat[object_body].reshape(3, 3)
-            contacts.append((contact.pos[standing] - data.xpos[object_body]) @ rotation)
+            contacts.append((contact.pos[standing] - data.site_xpos[frame]) @ rotation)
         error = np.linalg.norm(tool_pose[:, :3] - control.tips[:, :3, 3], axis=1).max()
         return Motion(
             times=np.arange(num) * self.sample_period,
-            object_pose=qpos[:, :7].copy(),
+            object_pose=object_pose,
             tool_pose=tool_pose,
             joints=qpos[:, 7:].copy() if self.embodiment == "arm" else np.empty((num, 0)),
             on_blade=on_blade,
