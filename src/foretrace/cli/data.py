@@ -136,8 +136,11 @@ def describe(path: Positional[Path], out: Path | None = None) -> None:
 
     figures = describe_dataset(Dataset.open(path))
     _print_outcomes(figures["outcomes"])
+    if len(kinds := figures["outcomes_by_kind"]) > 1:
+        for kind, counts in kinds.items():
+            print(f"{kind:>10}: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     for name, value in figures.items():
-        if name not in ("outcomes", "interactions"):
+        if not isinstance(value, dict) and name != "interactions":
             print(f"{name.replace('_', ' '):>42} {value:10.4g}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from foretrace.evaluation import figures
 from foretrace.evaluation.figures import CM, STYLE, TOOL_REACH, Scene
 from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
-from foretrace.objects import MeshObject, ObjectModel
+from foretrace.objects import Cylinder, MeshObject, ObjectModel
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)
 """Where the camera stands: turned from the action's direction towards its right, and raised."""
@@ -28,6 +28,8 @@ LIGHT = np.array([-0.35, -0.55, 0.76])
 """Direction towards the light."""
 BLADE_WIDTH, BLADE_LENGTH = 0.0055, 0.045
 """The drawn blade [m]; a thinner shaft continues it."""
+DRAWN_FACETS = 4
+"""Of a cylinder's facets every fourth edge is drawn, so that one sees it roll."""
 LAST_FRAME_TIME = 1.2
 """How long an animation rests on its end before it repeats [s]."""
 
@@ -101,6 +103,10 @@ def faces_of(obj: ObjectModel) -> list[Float[np.ndarray, "_ 3"]]:
     """The object's surface as polygons, counter-clockwise from outside, in the object frame [m]."""
     if isinstance(obj, MeshObject):
         return list(obj.vertices[obj.faces])
+    if isinstance(obj, Cylinder):
+        near, far = (end[::DRAWN_FACETS] for end in np.split(obj.convex_pieces()[0], 2))
+        strips = zip(near, np.roll(near, -1, axis=0), np.roll(far, -1, axis=0), far, strict=True)
+        return [near[::-1], far, *(np.stack(corners) for corners in strips)]
     rim = min((piece[piece[:, 2] > 0, 2].min() for piece in obj.convex_pieces()), default=0.0)
     bottom, top = obj.support_corners, obj.corners
     layers = [
@@ -173,7 +179,10 @@ def _draw_table(ax: Axes, scene: Scene) -> None:
 
 def _table_corners(scene: Scene) -> np.ndarray:
     """(4, 3) corners of the drawn part of the table."""
-    (x0, y0), (x1, y1) = scene.outline.min(axis=0) - 0.04, scene.outline.max(axis=0) + 0.04
+    # As far as an object rolls; one that falls has left the table.
+    on_table = [path[path[:, 2] > 0, :2] for _, path, *_ in scene.paths()]
+    seen = np.concatenate([scene.outline, *on_table])
+    (x0, y0), (x1, y1) = seen.min(axis=0) - 0.04, seen.max(axis=0) + 0.04
     x0, x1 = x0 - 0.04, x1 + 0.03
     return np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
 

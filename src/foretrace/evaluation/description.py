@@ -1,5 +1,6 @@
 """What is in a data set, in a few figures."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         dataset: The interactions.
 
     Returns:
-        ``outcomes`` (counts), ``interactions``, and for the levered ones: ``median_final_tilt_deg``,
+        ``outcomes`` (counts), ``outcomes_by_kind`` (the same for each kind of object), ``interactions``,
+        ``fell_off_the_table`` (count), ``median_rolled_cm`` (distance that the rolled ones went, if there are any), and
+        for the levered ones: ``median_final_tilt_deg``,
         ``median_final_rise_cm`` of the centre of mass, ``median_slide_mm`` of the centre of mass along the table before
         the lift, ``largest_path_error_mm`` of the blade, ``two_support_corners`` (share of lever-ups with exactly two
         observed support corners) and ``rule_agreement`` (share of those whose corners the closed-form rule of
@@ -26,7 +29,17 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     """
     levered = dataset.where(outcome=str(Outcome.LEVERED))
     rows = [_describe(levered[k]) for k in range(len(levered))]
-    figures: dict[str, Any] = {"outcomes": dataset.outcomes(), "interactions": len(dataset)}
+    kinds = np.array([json.loads(text)["kind"] for text in dataset.table["object"].to_pylist()])
+    figures: dict[str, Any] = {
+        "outcomes": dataset.outcomes(),
+        "outcomes_by_kind": {str(kind): dataset[kinds == kind].outcomes() for kind in np.unique(kinds)},
+        "interactions": len(dataset),
+        "fell_off_the_table": dataset.table["fall_index"].drop_null().length(),
+    }
+    if rolled := list(dataset.where(outcome=str(Outcome.ROLLED))):
+        paths = [interaction.effect.com_trajectory[:, :2] for interaction in rolled]
+        distances = [np.linalg.norm(path[-1] - path[0]) for path in paths]
+        figures["median_rolled_cm"] = float(CM * np.median(distances))
     if not rows:
         return figures
     angle, rise, slide, error, two, right = np.array(rows).T
@@ -49,7 +62,10 @@ def _describe(interaction: Interaction) -> tuple[float, float, float, float, boo
     slide = np.linalg.norm(com[int(raised.argmax()), :2] - com[0, :2])
     observed = effect.support_corners
     com_in_object = obj.mass_properties(interaction.physics.density).com[:2]
-    named = support_edge(obj.support_corners, interaction.action.contact, com_in_object)
+    # A round object stands on a line, not on a face with edges.
+    named = (
+        () if obj.is_round else support_edge(obj.support_corners, interaction.action.contact, com_in_object)
+    )
     return (
         float(np.rad2deg(angle[-1])),
         float(CM * (com[-1, 2] - com[0, 2])),

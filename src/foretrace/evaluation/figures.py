@@ -268,7 +268,8 @@ def draw_from_the_side(ax: Axes, scene: Scene, instants: int = 5) -> None:
     if scene.tool is not None:
         x, _, z = tool_line(scene.tool[-1])[1] * CM
         ax.text(x, z, "  blade", color=TOOL_COLOR)
-    ax.set(xlim=(left, right), ylim=(-1.2, top), aspect="equal", title="From the side")
+    lowest = min([path[:, 2].min() * CM - 1.0 for _, path, *_ in scene.paths()], default=0.0)  # it may fall
+    ax.set(xlim=(left, right), ylim=(min(-1.2, lowest), top), aspect="equal", title="From the side")
     ax.set(xlabel="x, along the action [cm]", ylabel="z, up [cm]", anchor="N")
 
 
