@@ -21,8 +21,9 @@ from foretrace.features import FEATURES, Autoencoder256, NoFeatures
 from foretrace.interactions.splits import Split
 from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
 from foretrace.predictor import training as training_module
+from foretrace.predictor.optimizer import parameter_groups
 from foretrace.predictor.run_folder import RunFolder
-from foretrace.predictor.training import fit_predictor, learning_rate, parameter_groups
+from foretrace.predictor.training import fit_predictor, learning_rate
 from foretrace.trajectories import mean_distance
 
 SMALL = TrainConfig(features="none", hidden=16, epochs=3, min_steps=1, split=None, window=6, device="cpu")

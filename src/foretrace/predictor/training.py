@@ -4,17 +4,15 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
-from torch import Tensor, nn
+from torch import Tensor
 
 from foretrace.errors import TrainingError
 from foretrace.features import FeatureExtractor, make_features
@@ -24,8 +22,10 @@ from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import load_tensors, read_tensors
+from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.files import write_tensors
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
+from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
 from foretrace.predictor.states import (
     StateKind,
@@ -35,11 +35,6 @@ from foretrace.predictor.states import (
     valid_samples,
 )
 from foretrace.trajectories import final_distance, mean_distance
-
-FULL_RATE_INPUTS = 256
-"""Units with more inputs than this learn at a lower rate."""
-FEATURE_DECAY = 1 / 800
-"""Weight decay per feature."""
 
 
 @dataclass(frozen=True)
@@ -195,8 +190,8 @@ def train_predictor(
         )
         train, validation = (_prepare(batch[rows], predictor) for rows in (split.train, split.validation))
         with (
-            _display(config.num_epochs(len(split.train)), progress) as (report, show),
-            _tensorboard(folder.path / TENSORBOARD) as log,
+            terminal(config.num_epochs(len(split.train)), progress) as (report, show),
+            tensorboard(folder.path / TENSORBOARD) as log,
         ):
 
             def tell(row: Row, done: Progress) -> None:
@@ -244,8 +239,7 @@ class _Training:
             predictor.normalise(train.states) * torch.from_numpy(valid).to(predictor.device)[..., None]
         )
         self.lengths = torch.from_numpy(valid_lengths(train.batch)).to(predictor.device)
-        # The loss of a state's small change is small: Adam's usual epsilon of 1e-8 would outweigh its gradient.
-        self.optimizer = torch.optim.AdamW(parameter_groups(predictor), eps=1e-12, fused=True)
+        self.optimizer = make_optimizer(predictor)
 
     def run(
         self,
@@ -339,28 +333,6 @@ class _Training:
         }
 
 
-def parameter_groups(predictor: EffectPredictor) -> list[dict[str, Any]]:
-    """What is trainable, grouped by its share of the learning rate and by its weight decay.
-
-    One step of Adam changes every weight by about the learning rate, and so what a unit sees by that times its
-    number of inputs. From ``FULL_RATE_INPUTS`` inputs on the rate is therefore lowered in proportion (Yang et
-    al., 2021, "Tensor programs V"). The weights of the features keep the full rate and decay in proportion to
-    the number of features instead (Loshchilov and Hutter, 2019): thousands of them tell every training object
-    apart, four do not.
-    """
-    readers = {id(parameter) for parameter in predictor.feature_weights}
-    groups: dict[tuple[float, float], list[nn.Parameter]] = {}
-    for parameter in predictor.parameters():
-        if parameter.requires_grad:
-            inputs = parameter[0].numel() if parameter.dim() > 1 else 0
-            if id(parameter) in readers:
-                key = 1.0, FEATURE_DECAY * inputs
-            else:
-                key = min(1.0, FULL_RATE_INPUTS / max(1, inputs)), 0.0
-            groups.setdefault(key, []).append(parameter)
-    return [{"params": p, "share": share, "weight_decay": decay} for (share, decay), p in groups.items()]
-
-
 def find_device(name: str) -> torch.device:
     """The device of a name.
 
@@ -423,43 +395,3 @@ def _thread_count(threads: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def _tensorboard(path: Path) -> Iterator[Callable[[Row], None]]:
-    """A function that logs a row of metrics for TensorBoard."""
-    from torch.utils.tensorboard import SummaryWriter  # takes a second to import
-
-    with ExitStack() as stack:
-        writer: SummaryWriter | None = None
-
-        def log(row: Row) -> None:
-            nonlocal writer
-            epoch = int(row["epoch"])
-            writer = writer or stack.enter_context(SummaryWriter(str(path), purge_step=epoch))
-            for name, value in row.items():
-                writer.add_scalar(name, value, epoch)
-            writer.flush()
-
-        yield log
-
-
-@contextmanager
-def _display(epochs: int, visible: bool) -> Iterator[tuple[Callable[[str], None], Callable[..., None]]]:
-    """A progress bar: a function for lines of text and one for the end of an epoch."""
-    columns = (TextColumn("epoch {task.completed:.0f}/{task.total:.0f}"), BarColumn())
-    numbers = TextColumn("{task.description}")
-    with ProgressBar(*columns, numbers, TimeRemainingColumn(), disable=not visible) as bar:
-        task = bar.add_task("", total=epochs)
-
-        def show(row: dict[str, Any], done: Progress) -> None:
-            best = (
-                done.history[done.best_epoch - 1]["validation_full_cm"] if done.best_epoch else float("nan")
-            )
-            text = (
-                f"loss {row['train_loss']:.5f}, validation {row['validation_full_cm']:.2f} cm "
-                f"(best {best:.2f} cm, epoch {done.best_epoch})"
-            )
-            bar.update(task, completed=done.epoch, description=text)
-
-        yield bar.console.print, show
