@@ -37,7 +37,7 @@ class Replay:
     @property
     def right_face(self) -> bool:
         """Whether the simulated object ends on the recorded side."""
-        return self.down_error < FACE_TOLERANCE
+        return bool(self.down_error < FACE_TOLERANCE)
 
     def rows(self) -> list[dict[str, Any]]:
         """The errors over time, one row per frame."""
@@ -67,7 +67,7 @@ class Replay:
             "mean_rotation_error_deg": float(degrees.mean()),
             "final_rotation_error_deg": float(degrees[-1]),
             "down_error_deg": float(np.rad2deg(self.down_error)),
-            "right_face": bool(self.right_face),
+            "right_face": self.right_face,
         }
 
 

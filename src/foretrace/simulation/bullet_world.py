@@ -140,12 +140,13 @@ class World:
         frame = np.eye(4)
         frame[:3, :3], frame[:3, 3] = axes, body.mass.com
         pose = matrix_to_pose(T_world_object @ frame)
-        number = self.bullet.createMultiBody(
-            body.mass.mass,
-            self._shape(body.shapes, invert_transform(frame)),
-            basePosition=pose[:3].tolist(),
-            baseOrientation=pose[[4, 5, 6, 3]].tolist(),
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            number = self.bullet.createMultiBody(
+                body.mass.mass,
+                self._shape(body.shapes, invert_transform(frame), Path(folder)),
+                basePosition=pose[:3].tolist(),
+                baseOrientation=pose[[4, 5, 6, 3]].tolist(),
+            )
         self._surface(number, 1.0)
         self.bullet.changeDynamics(number, -1, localInertiaDiagonal=inertia.tolist(), restitution=restitution)
         self._frames[number] = invert_transform(frame)
@@ -221,8 +222,10 @@ class World:
             collisionMargin=COLLISION_MARGIN,
         )
 
-    def _shape(self, shapes: tuple[CollisionShape, ...], T_body_object: Float[np.ndarray, "4 4"]) -> int:
-        """The collision shape of a body, in its own frame."""
+    def _shape(
+        self, shapes: tuple[CollisionShape, ...], T_body_object: Float[np.ndarray, "4 4"], folder: Path
+    ) -> int:
+        """The collision shape of a body, in its own frame; a folder takes the files that it may need."""
         b = self.bullet
         hulls = [transform_points(T_body_object, s.vertices) for s in shapes if isinstance(s, HullShape)]
         cylinders = [s for s in shapes if isinstance(s, CylinderShape)]
@@ -242,11 +245,10 @@ class World:
         together = _convex_union(hulls)
         if together is not None:
             return b.createCollisionShape(b.GEOM_MESH, vertices=together.tolist())
-        # Only a file can hold several hulls.
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "pieces.obj"
-            file.write_text(_wavefront(hulls), encoding="ascii")
-            return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
+        # Only a file can hold several hulls. Bullet reads it once more when the body is made.
+        file = folder / "pieces.obj"
+        file.write_text(_wavefront(hulls), encoding="ascii")
+        return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
 
 
 def _convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:

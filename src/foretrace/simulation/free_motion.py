@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from foretrace.errors import SimulationError
-from foretrace.geometry import continuous_quaternions, quaternion_to_matrix
+from foretrace.geometry import Numbers, continuous_quaternions, quaternion_to_matrix
 from foretrace.objects import CollisionShape, CylinderShape, HullShape, MassProperties, ObjectModel
 from foretrace.objects.model import convex_mass_properties
 
@@ -141,10 +141,10 @@ class Surroundings:
 
 def simulate_free_motion(
     body: Body,
-    start: Sequence[float] | Float[np.ndarray, " 7"],
+    start: Numbers,
     duration: float,
     *,
-    velocity: Sequence[float] | Float[np.ndarray, " 6"] = (0.0,) * 6,
+    velocity: Numbers = (0.0,) * 6,
     surroundings: Surroundings = Surroundings(),
     engine: str = "mujoco",
     timestep: float = 0.002,
