@@ -2,8 +2,7 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -37,7 +36,7 @@ from foretrace.interactions.splits import (
 from foretrace.predictor import EffectPredictor, TrainConfig
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import rest_states, valid_lengths, valid_samples
-from foretrace.predictor.training import find_device, fit_predictor
+from foretrace.predictor.training import find_device, fit_predictor, thread_count
 
 SEEDS = tuple(range(10))
 """The paper's ten randomisation seeds."""
@@ -252,7 +251,7 @@ class PaperWork:
         batch = _levered_once(self.data, self.fingerprint)
         split = split_of(trial, batch, self.recipe.proportional)
         config = self.recipe.configure(trial) if trial.features in FEATURES else self.recipe.training
-        with _thread_count(config.threads):
+        with thread_count(config.threads):
             if EXPERIMENTS[trial.experiment].names_corners:
                 started = perf_counter()
                 options = self.recipe.options(trial)
@@ -311,16 +310,6 @@ def _levered_once(data: str, fingerprint: str) -> InteractionBatch:
 def _inputs_once(data: str, fingerprint: str, label: str, options: tuple[tuple[str, Option], ...]) -> Tensor:
     """Inputs of features for the whole data set, once per process."""
     return make_features(label, **dict(options)).inputs(_levered_once(data, fingerprint))
-
-
-@contextmanager
-def _thread_count(threads: int | None) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 # --- the whole of it --------------------------------------------------------------------------------------

@@ -131,7 +131,7 @@ def fit_predictor(
     Raises:
         TrainingError: Unknown features or device, or a loss that is no longer finite.
     """
-    with _thread_count(config.threads), _made(config, batch) as predictor:
+    with thread_count(config.threads), _made(config, batch) as predictor:
         keeper = _Memory()
         inputs = predictor.features.inputs(batch) if inputs is None else inputs
         train, validation = (
@@ -175,7 +175,7 @@ def train_predictor(
     batch = data if isinstance(data, InteractionBatch) else data.batch()
     split = _choose_split(batch, config) if split is None else split
     folder = RunFolder(out)
-    with _thread_count(config.threads), _made(config, batch) as predictor:
+    with thread_count(config.threads), _made(config, batch) as predictor:
         surroundings = ("device", "threads", "precision")
         training = {name: value for name, value in asdict(config).items() if name not in surroundings}
         training |= {"data": fingerprint(batch), "rows": _hash_split(split)}
@@ -388,7 +388,8 @@ def _seeded(seed: int, epoch: int, device: torch.device) -> Iterator[None]:
 
 
 @contextmanager
-def _thread_count(threads: int | None) -> Iterator[None]:
+def thread_count(threads: int | None) -> Iterator[None]:
+    """PyTorch with so many threads for a while; None leaves its choice."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads or before)
     try:
