@@ -18,6 +18,8 @@ from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import Interaction, Outcome
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import Box, Cylinder, Prism
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig
@@ -48,6 +50,12 @@ def reluctant_trial(config: CollectConfig, id: int) -> Interaction:
 
 def interrupted_trial(config: CollectConfig, id: int) -> Interaction:
     if id == 150:
+        raise KeyboardInterrupt
+    return fake_trial(config, id)
+
+
+def interrupted_after_a_shard(config: CollectConfig, id: int) -> Interaction:
+    if id == 110:
         raise KeyboardInterrupt
     return fake_trial(config, id)
 
@@ -132,6 +140,97 @@ def test_simulate_trial_hands_everything_over(monkeypatch):
     interaction = simulate_trial(SMALL, 17)
     assert calls == [(SMALL.simulation, trial(SMALL, 17)[2], 17)]
     assert interaction.id == 17
+
+
+def test_solids_come_in_threes_with_one_mask_and_the_same_actions():
+    config = CollectConfig(objects=6, recipe="solids")
+    assert num_trials(config) == 6 * 8
+    for id in (0, 5, 24):
+        cylinder, box, flat = (trial(config, id + 8 * k) for k in range(3))
+        assert [type(obj) for obj, _, _ in (cylinder, box, flat)] == [Cylinder, Box, Prism]
+        for _, action, _ in (box, flat):
+            np.testing.assert_array_equal(action.contact, cylinder[1].contact)
+        masks = [TopDownView.of(obj, action).mask for obj, action, _ in (cylinder, box, flat)]
+        np.testing.assert_array_equal(masks[0], masks[1])
+        np.testing.assert_array_equal(masks[0], masks[2])
+        assert len({seed for _, _, seed in (cylinder, box, flat)}) == 3
+    assert trial(config, 0)[0].to_dict() != trial(config, 24)[0].to_dict()
+
+
+def test_the_mixed_recipe_takes_turns():
+    config = CollectConfig(objects=40, recipe="mixed")
+    kinds = []
+    located = [collecting._locate(config, id) for id in range(num_trials(config))]
+    for k in range(40):
+        obj, _, _ = trial(config, located.index((k, 0)))
+        kinds.append(type(obj))
+        assert located.count((k, 0)) == 1
+        assert sum(index == k for index, _ in located) == 2 * len(obj.corners) == 2 * num_corners("mixed", k)
+    assert kinds == [Prism, Prism, Cylinder, Box, Prism] * 8
+    prisms = [num_corners("mixed", k) for k in range(40) if k % 5 < 2]
+    assert sorted(prisms) == sorted([*range(3, 11)] * 2)
+    fewer = replace(config, objects=11)
+    for id in (0, 13, 50, num_trials(fewer) - 1):
+        assert trial(fewer, id)[0].to_dict() == trial(config, id)[0].to_dict()
+        assert trial(fewer, id)[2] == trial(config, id)[2]
+
+
+def test_a_mixed_data_set_is_sound_reproducible_and_resumable(tmp_path):
+    config = CollectConfig(objects=15, recipe="mixed")
+    collect(config, tmp_path / "one", workers=1, console=quiet(), simulate=fake_trial)
+    folder = tmp_path / "two"
+    with pytest.raises(KeyboardInterrupt):
+        collect(config, folder, workers=1, console=quiet(), simulate=interrupted_after_a_shard)
+    with pytest.raises(DatasetError, match="begun with recipe = mixed, asked for is recipe = paper"):
+        collect(replace(config, recipe="paper"), folder, workers=1, console=quiet(), simulate=fake_trial)
+    collect(config, folder, workers=1, console=quiet(), simulate=fake_trial)
+    assert shards_of(folder) == shards_of(tmp_path / "one")
+    assert examine(folder).findings == ()
+    dataset = Dataset.open(folder)
+    again, _, _ = trial(config, 30)
+    assert dataset.with_id(30).object.to_dict() == again.to_dict()
+    assert len(dataset.batch()) == len(dataset)
+
+
+def test_a_data_set_from_before_the_recipes_goes_on(tmp_path, reference):
+    folder = tmp_path / "old"
+    collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
+    manifest = storage.read_manifest(folder)
+    configuration = manifest["configuration"]
+    del configuration["recipe"], configuration["simulation"]["watch_time"]
+    for name in ("rolling_friction", "table_edge"):
+        del configuration["simulation"]["physics"][name]
+    table, _ = storage.read_shard(folder, storage.shard_name(0))
+    older = table.drop_columns(["fall_index", "rolling_friction", "table_edge"])
+    manifest["shards"][storage.shard_name(0)] = storage.write_shard(folder, storage.shard_name(0), older)
+    storage.write_manifest(folder, manifest)
+    assert len(Dataset.open(folder, failed=True)) == 208
+    (folder / storage.shard_name(1)).unlink()
+    collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
+    assert examine(folder).findings == ()
+    first = Dataset.open(folder)[0]
+    assert (first.effect.fall_index, first.physics.table_edge) == (None, None)
+    assert first.physics == Dataset.open(reference)[0].physics
+    watched = replace(SMALL, simulation=SimulationConfig(watch_time=1.5))
+    with pytest.raises(DatasetError, match=r"begun with simulation\.watch_time = 0\.0, asked for is"):
+        collect(watched, folder, workers=1, console=quiet(), simulate=fake_trial)
+
+
+def test_falls_and_edges_survive_storing(tmp_path):
+    made = fake_trial(SMALL, 3)
+    physics = replace(made.physics, table_edge=0.4, rolling_friction=3e-4)
+    made = replace(made, effect=replace(made.effect, fall_index=31), physics=physics)
+    stored = storage.decode(storage.to_table([storage.encode(made, 0)]).to_pylist()[0])
+    assert stored.effect.fall_index == 31
+    assert stored.physics == physics
+
+
+@pytest.mark.parametrize("recipe", ["Solids", "", "prisms"])
+def test_unknown_recipes_are_refused(recipe):
+    with pytest.raises(
+        SimulationError, match=f"recipe '{recipe}' is unknown: choose one of paper, solids, mixed"
+    ):
+        CollectConfig(recipe=recipe)
 
 
 @pytest.mark.parametrize("wrong", [{"objects": 0}, {"contacts_per_edge": 0}, {"seed": -1}])

@@ -293,7 +293,7 @@ def test_objects_survive_json_to_the_last_digit(obj):
 @pytest.mark.parametrize(
     ("values", "fault"),
     [
-        ({"kind": "blob"}, "kind 'blob': available are prism, mesh"),
+        ({"kind": "blob"}, "kind 'blob': available are prism, box, cylinder, mesh"),
         ({}, "kind None"),
         ({"kind": "prism"}, "prism is not usable"),
         ({"kind": "mesh", "vertices": [], "faces": [], "bevel": [1]}, "mesh is not usable"),
