@@ -86,6 +86,15 @@ def test_tool_path_sweep() -> None:
     assert "levered" in outcomes
 
 
+def test_same_shadow(tmp_path: Path) -> None:
+    printed = run_python(EXAMPLES / "same_shadow.py", tmp_path / "figure.png")
+    rolled, tumbled, flat = (float(text) for text in re.findall(r"(-?[\d.]+) cm along", printed))
+    assert "cylinder: rolled" in printed
+    assert "box: tumbled" in printed
+    assert rolled > 12 > tumbled > 4 > abs(flat)
+    assert Image.open(tmp_path / "figure.png").width > 1500
+
+
 def test_render_scene(tmp_path: Path) -> None:
     obj = paper_objects(0, 1)[0]
     try:
