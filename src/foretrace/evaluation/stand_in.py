@@ -252,5 +252,5 @@ def hull_of(view: TopDownView) -> TopDownView:
     pixels = np.stack(np.meshgrid(np.arange(view.mask.shape[1]), np.arange(view.mask.shape[0])), axis=-1)
     # In whole numbers, so that a mask that is convex already stays as it is.
     sides = cross(ahead, pixels[..., None, :] - hull)  # (row, column, side of the hull)
-    mask = (sides >= 0).all(axis=-1) | (sides <= 0).all(axis=-1)
+    mask = np.asarray((sides >= 0).all(axis=-1) | (sides <= 0).all(axis=-1))
     return TopDownView(mask, np.where(mask, view.height.max(), np.float32(0)), view.metres_per_pixel)

@@ -1,0 +1,225 @@
+"""What the stand-in for the real robot levers up: the paper's printed shapes, everyday objects, and given ones.
+
+The paper prints a pentagon and a heptagon (tables 1 and 2) and takes a book, a PCB, an HDD and a table-tennis racket
+(figure 15); it tells no dimensions. Those here are of usual sizes. All are slabs with a bevelled lower rim.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from foretrace.actions import LeverUp
+from foretrace.errors import ForetraceError, ShapeError
+from foretrace.geometry import convex_hull, inward_normals
+from foretrace.interactions.record import Physics
+from foretrace.objects import CIRCLE_RADIUS, Prism, read_silhouette
+from foretrace.objects.model import fitting_bevel
+
+Group = Literal["printed", "everyday", "silhouettes", "prisms"]
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+GIVEN_HEIGHT = 0.02
+"""Thickness of given objects that do not tell it [m]."""
+NUM_CONTACTS = 5
+"""Contact points of an object that is not printed."""
+FIRST_CONTACT = 0.3
+"""Where the first one lies, as a share of the way to the second: not symmetric on a rectangle."""
+CORNER_DISTANCE = 0.01
+"""Contact points keep this distance from corners, or stay in the middle of shorter edges [m]."""
+ON_HULL = 0.001
+"""An edge whose middle is nearer than this to the convex hull's outline lies on it [m]."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An object and where it is levered up."""
+
+    name: str
+    """Name in tables."""
+    group: Group
+    """Where it comes from."""
+    obj: Prism
+    """The object as simulator and predictor are told of it."""
+    actions: tuple[LeverUp, ...]
+    """Lever-ups as they are told."""
+    density: float = Physics.density
+    """Density [kg/m^3]."""
+    hull: bool = False
+    """Whether the predictor sees the convex hull of its mask (paper, figure 15)."""
+
+
+def on_circle(degrees: Sequence[float]) -> Prism:
+    """A prism with corners at given angles on the circle that the paper's objects have theirs on."""
+    angles = np.deg2rad(np.asarray(degrees, dtype=float))
+    return Prism(CIRCLE_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)]))
+
+
+def slab(length: float, width: float, height: float) -> Prism:
+    """A rectangular slab [m]."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [length / 2, width / 2]
+    return Prism(corners, height, fitting_bevel(corners, height))
+
+
+def racket(
+    head: tuple[float, float] = (0.157, 0.150),
+    handle: tuple[float, float] = (0.1, 0.028),
+    height: float = 0.012,
+) -> Prism:
+    """A table-tennis racket: an ellipse with a straight handle, equally thick all over.
+
+    Args:
+        head: Length and width of the blade [m].
+        handle: Length and width of the handle [m].
+        height: Thickness [m].
+    """
+    a, b = head[0] / 2, head[1] / 2
+    opening = float(np.arcsin(handle[1] / 2 / b))  # the handle leaves the ellipse at this angle from its axis
+    angles = np.linspace(-np.pi + opening, np.pi - opening, 25)
+    outline = np.column_stack([a * np.cos(angles), b * np.sin(angles)])
+    end = -a - handle[0]
+    corners = np.concatenate([outline, [[end, handle[1] / 2], [end, -handle[1] / 2]]])
+    return Prism(corners, height, fitting_bevel(corners, height))
+
+
+PENTAGON = on_circle((0, 58, 142, 205, 290))
+"""Stands for the paper's printed pentagon: irregular, of the size of its simulated objects."""
+HEPTAGON = on_circle((0, 38, 95, 152, 196, 262, 308))
+"""Stands for the paper's printed heptagon."""
+
+
+def printed_shapes() -> list[Subject]:
+    """Pentagon and heptagon, levered at the middle of every edge (paper, tables 1 and 2)."""
+    return [
+        Subject(name, "printed", obj, tuple(LeverUp.at_edge(obj, k) for k in range(len(obj.corners))))
+        for name, obj in (("pentagon", PENTAGON), ("heptagon", HEPTAGON))
+    ]
+
+
+def everyday_objects() -> list[Subject]:
+    """HDD, PCB, book and racket in usual sizes (paper, figure 15).
+
+    - HDD: 147 x 101.6 x 26.1 mm, the 3.5-inch form factor (SFF-8301), 0.7 kg.
+    - PCB: 170 x 170 mm, a mini-ITX board, 0.35 kg. The bare board of 1.6 mm is no thicker than the blade and its
+      clearance: with its solder joints and low components it counts as a slab of 8 mm.
+    - Book: A5 (ISO 216), 210 x 148 mm, 15 mm thick, as dense as paper.
+    - Racket: blade 157 x 150 mm, handle 100 x 28 mm, 0.18 kg. 12 mm thick: 6 mm of wood and two coverings of 3 mm,
+      where the ITTF's laws allow 4 mm each. The handle, in truth thicker, is taken to be as thick as the blade.
+    """
+    objects = {
+        "HDD": (slab(0.147, 0.1016, 0.0261), 0.7),
+        "PCB": (slab(0.17, 0.17, 0.008), 0.35),
+        "book": (slab(0.21, 0.148, 0.015), 0.37),
+        "racket": (racket(), 0.18),
+    }
+    return [make_subject(name, "everyday", obj, mass) for name, (obj, mass) in objects.items()]
+
+
+def make_subject(name: str, group: Group, obj: Prism, mass: float | None = None) -> Subject:
+    """An object of a mass [kg], levered at points all around it."""
+    density = Physics.density if mass is None else mass / obj.mass_properties(1.0).mass
+    return Subject(name, group, obj, contacts_around(obj, NUM_CONTACTS), density, hull=True)
+
+
+def contacts_around(obj: Prism, count: int) -> tuple[LeverUp, ...]:
+    """Lever-ups at equal distances along the outline, where it lies on its convex hull.
+
+    Elsewhere, the blade would meet the object behind the outline that a predictor is shown. An object that nowhere
+    lies on its hull, such as a star, is levered all around it.
+    """
+    starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
+    lengths = np.linalg.norm(stops - starts, axis=1)
+    hull = shapely.LinearRing(convex_hull(obj.corners))
+    lengths_on_hull = np.where(
+        shapely.distance(hull, shapely.points((starts + stops) / 2)) < ON_HULL, lengths, 0.0
+    )
+    lengths_used = lengths_on_hull if lengths_on_hull.any() else lengths
+    ends, normals, actions = np.cumsum(lengths_used), inward_normals(obj.corners), []
+    for k in range(count):
+        place = (k + FIRST_CONTACT) / count * ends[-1]
+        edge = int(np.searchsorted(ends, place, side="right"))
+        margin = min(CORNER_DISTANCE, lengths[edge] / 2)
+        along = np.clip(place - (ends[edge] - lengths_used[edge]), margin, lengths[edge] - margin)
+        contact = starts[edge] + (stops - starts)[edge] * along / lengths[edge]
+        actions.append(LeverUp(contact, normals[edge]))
+    return tuple(actions)
+
+
+def read_silhouettes(
+    folder: Path, size: float = 0.18, scale: float | None = None, height: float = GIVEN_HEIGHT
+) -> list[Subject]:
+    """Objects from a folder of pictures, one silhouette each, white on black.
+
+    Args:
+        folder: The folder; every picture in it is read.
+        size: Longer side of each silhouette's bounding box [m].
+        scale: Size of a pixel in all of them instead [m].
+        height: Thickness of all of them [m].
+
+    Raises:
+        ShapeError: The folder is missing or has no picture, or one of them does not show one whole object.
+    """
+    if not folder.is_dir():
+        raise ShapeError(f"{folder} is no folder: give one with pictures of silhouettes, white on black")
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+    if not files:
+        raise ShapeError(
+            f"{folder} has no silhouettes: put pictures there ({', '.join(PICTURES)}), one object each"
+        )
+    subjects = []
+    for file in files:
+        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise ShapeError(f"cannot read a picture from {file}: give a PNG or JPEG, white object on black")
+        try:
+            metres = size / (np.ptp(np.argwhere(read_silhouette(mask)), axis=0).max() + 1)
+            obj = Prism.from_mask(mask, metres if scale is None else scale, height)
+            subjects.append(make_subject(file.stem, "silhouettes", obj))
+        except ForetraceError as error:
+            raise ShapeError(f"{file}: {error}") from error
+    return subjects
+
+
+def read_prisms(file: Path, height: float = GIVEN_HEIGHT) -> list[Subject]:
+    """Objects from a JSON file: by name, ``corners_m`` and, if it is known, ``mass_kg`` and ``height_m``.
+
+    Args:
+        file: The file.
+        height: Thickness of those that do not tell it [m].
+
+    Raises:
+        ShapeError: The file is missing or not such a file, or an outline is not usable.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ShapeError(f"cannot read prisms from {file} ({error})") from error
+    if not isinstance(content, dict) or not content:
+        raise ShapeError(f'{file} names no prism: write {{"name": {{"corners_m": [[x, y], ...]}}, ...}}')
+    subjects = []
+    for name, values in content.items():
+        if not isinstance(values, dict) or "corners_m" not in values:
+            raise ShapeError(f"{file}: {name} has no corners_m: give its corners in metres")
+        corners, mass = values["corners_m"], values.get("mass_kg")
+        thickness = values.get("height_m", height)
+        if not all(isinstance(x, int | float) and x > 0 for x in (thickness, 1.0 if mass is None else mass)):
+            raise ShapeError(
+                f"{file}: {name} has height_m {thickness!r}, mass_kg {mass!r}: give positive numbers"
+            )
+        try:
+            obj = Prism(corners, thickness, fitting_bevel(Prism(corners).corners, thickness))
+            subjects.append(make_subject(name, "prisms", obj, mass))
+        except ForetraceError as error:
+            raise ShapeError(f"{file}: {name}: {error}") from error
+    return subjects
+
+
+def outline_in_action(subject: Subject, contact: int) -> Float[np.ndarray, "n 2"]:
+    """A subject's outline at rest in the frame of one of its actions [m]."""
+    T = subject.actions[contact].T_action_object
+    return subject.obj.corners @ T[:2, :2].T + T[:2, 3]
