@@ -105,7 +105,7 @@ def test_the_mirrored_object_gives_the_mirrored_effect(engine: str) -> None:
 
 @every_engine
 def test_half_the_time_step_agrees(engine: str) -> None:
-    """MuJoCo's soft contacts hardly notice; in Bullet the first impact's depth is of the order of a step's travel."""
+    """MuJoCo's soft contacts hardly notice; Bullet's errors are of the first order in the step."""
     differences = []
     for k in range(0, NUM_TRIALS, 2):
         full, fine = effect(engine, k), effect(engine, k, TIMESTEP / 2)
