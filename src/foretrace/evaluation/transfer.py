@@ -218,7 +218,7 @@ def _play_all(
 def _reported(
     contacts: Sequence[tuple[Subject, int]], all_played: Iterator[Played], console: Console
 ) -> Iterator[tuple[tuple[Subject, int], Played]]:
-    """The contacts with what was played, and progress on the console: a bar on a terminal, elsewhere a line for each object."""
+    """The contacts with what was played; progress is a bar on a terminal, elsewhere a line for each object."""
     columns = (MofNCompleteColumn(), BarColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=len(contacts))

@@ -1,0 +1,199 @@
+"""Pictures of the comparisons with the stand-in: the paper's figure 15, and the last panel of its figure 14."""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.evaluation.figures import (
+    ARROW_LENGTH,
+    CM,
+    DPI,
+    INK,
+    OBJECT_EDGE,
+    STYLE,
+    TOOL_COLOR,
+    Scene,
+    draw_from_the_side,
+)
+from foretrace.evaluation.transfer import Example
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
+
+HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
+BARS = {"predicted": ("distance_predicted_cm", VERMILLION), "simulated": ("distance_simulated_cm", BLUE)}
+PATHS = {"stand-in": (GREEN, "-", 2.4), "predicted": (VERMILLION, "--", 1.8), "simulated": (BLUE, "-.", 1.8)}
+PER_ROW = 7
+"""Masks side by side."""
+
+
+def objects_figure(
+    examples: Sequence[Example], rows: pd.DataFrame, paper: Mapping[str, float] | None = None
+) -> Figure:
+    """Masks of objects as the predictor sees them, and the errors on each (paper, figure 15).
+
+    Args:
+        examples: Every contact of the objects.
+        rows: Their lever-ups.
+        paper: The paper's errors by object [cm].
+    """
+    names = list(dict.fromkeys(example.subject.name for example in examples))
+    columns = min(len(names), PER_ROW)
+    lines = -(-len(names) // columns)
+    with mpl.rc_context(STYLE):
+        width = max(8.6, 1.75 * columns)
+        fig = Figure(
+            figsize=(width, 1.0 + width / columns * lines * 0.95 + 3.4), dpi=DPI, layout="constrained"
+        )
+        above, below = fig.subfigures(2, 1, height_ratios=[width / columns * lines * 0.95, 3.4])
+        cells = above.subplots(lines, columns, squeeze=False).ravel()
+        for ax, name in zip(cells, names, strict=False):
+            draw_view(ax, [example for example in examples if example.subject.name == name])
+        for ax in cells[len(names) :]:
+            ax.axis("off")
+        draw_errors(below.subplots(), rows, names, paper or {})
+        handles = [
+            Patch(color=MASK_COLOR, label="mask that the camera saw"),
+            Patch(color=HULL_COLOR, label="added by its convex hull"),
+            Line2D([], [], color=OBJECT_EDGE, linewidth=1, label="true outline"),
+            Line2D([], [], color=TOOL_COLOR, linewidth=2.4, marker="^", label="contact shown"),
+            Line2D([], [], color=INK, marker="o", linestyle="none", markersize=4, label="other contacts"),
+        ]
+        above.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+        title = "Objects as the predictor sees them, and the distance of its path from the stand-in's"
+        finish(
+            fig,
+            title,
+            "A simulated stand-in for the real robot: Bullet, other friction, errors of contact and camera",
+        )
+    return fig
+
+
+def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
+    """One object's mask and hull in the action frame of its first contact, action upwards; scales in cm."""
+    first = examples[0]
+    shown = first.observed.view.mask.astype(int) + first.view.mask
+    edge = np.array([-0.5, VIEW_SIZE - 0.5])
+    top, bottom = (CONTACT_PIXEL[0] - edge) * METRES_PER_PIXEL * CM
+    left, right = (CONTACT_PIXEL[1] - edge) * METRES_PER_PIXEL * CM
+    colors = ListedColormap(["white", HULL_COLOR, MASK_COLOR])
+    ax.imshow(shown, cmap=colors, vmin=0, vmax=2, extent=(left, right, bottom, top), interpolation="nearest")
+    T = first.subject.actions[first.contact].T_action_object
+    outline = first.subject.obj.corners @ T[:2, :2].T + T[:2, 3]
+    closed = np.concatenate([outline, outline[:1]]) * CM
+    ax.plot(closed[:, 1], closed[:, 0], color=OBJECT_EDGE, linewidth=1)
+    contacts = np.array([example.subject.actions[example.contact].contact for example in examples[1:]])
+    if len(contacts):
+        others = (contacts @ T[:2, :2].T + T[:2, 3]) * CM
+        ax.plot(others[:, 1], others[:, 0], "o", color=INK, markersize=4)
+    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 2.4, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+    low, high = np.minimum(outline.min(axis=0) * CM, [-5, 0]), outline.max(axis=0) * CM
+    middle, half = (low + high) / 2, max((high - low).max() / 2, 9) + 1.5
+    ax.set(
+        xlim=(middle[1] + half, middle[1] - half), ylim=(middle[0] - half, middle[0] + half), aspect="equal"
+    )
+    ax.set_title(first.subject.name, loc="center")
+    ax.set_xticks([]), ax.set_yticks([])
+    ax.spines[["left", "bottom"]].set_visible(False)
+    ax.plot(
+        [middle[1] - half + 5.8, middle[1] - half + 0.8], [middle[0] - half + 0.6] * 2, color=INK, linewidth=2
+    )
+    ax.text(middle[1] - half + 3.3, middle[0] - half + 1.1, "5 cm", ha="center", fontsize=8, color=INK)
+
+
+def draw_errors(ax: Axes, rows: pd.DataFrame, names: Sequence[str], paper: Mapping[str, float]) -> None:
+    """Mean and standard deviation for each object, every lever-up as a dot, the paper's value as a mark."""
+    rng = np.random.default_rng(0)
+    for k, name in enumerate(names):
+        mine = rows.loc[rows["object"].eq(name)]
+        for (column, color), shift in zip(BARS.values(), (-0.2, 0.2), strict=True):
+            values = mine[column].dropna().to_numpy(float)
+            if len(values) == 0:
+                continue
+            ax.bar(k + shift, values.mean(), width=0.36, color=color, alpha=0.35, edgecolor=color)
+            places = k + shift + rng.uniform(-0.12, 0.12, len(values))
+            ax.plot(places, values, "o", color=color, markersize=2.6, alpha=0.7, markeredgewidth=0)
+            if len(values) > 1:
+                ax.errorbar(
+                    k + shift, values.mean(), yerr=values.std(ddof=1), color=INK, capsize=3, linewidth=1.2
+                )
+        if name in paper:
+            ax.plot([k - 0.42, k + 0.02], [paper[name]] * 2, color=INK, linewidth=2.2, solid_capstyle="butt")
+            ax.text(
+                k - 0.44, paper[name], f"{paper[name]:.3f}", ha="right", va="center", fontsize=8, color=INK
+            )
+    grid(ax, ylabel="distance after time warping [cm]", xlim=(-0.75, len(names) - 0.5), ylim=(0, None))
+    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if len(names) > PER_ROW else {}
+    ax.set_xticks(range(len(names)), names, **turned)
+    ax.tick_params(axis="x", length=0)
+    handles: list[Patch | Line2D] = [
+        Patch(
+            facecolor=color,
+            alpha=0.45,
+            edgecolor=color,
+            label=f"stand-in against {name}: mean, sd, every lever-up",
+        )
+        for name, (_, color) in BARS.items()
+    ]
+    if paper:
+        handles.append(Line2D([], [], color=INK, linewidth=2.2, label="paper: real against predicted"))
+    ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3, fontsize=8.5)
+
+
+def paths_figure(examples: Sequence[Example]) -> Figure:
+    """Paths of the centre of mass from the side: stand-in, predicted, simulated (paper, figure 14, last panel).
+
+    Args:
+        examples: At most four of them look well.
+    """
+    with mpl.rc_context(STYLE):
+        fig = Figure(figsize=(3.6 * len(examples), 3.9), dpi=DPI, layout="constrained")
+        for ax, example in zip(fig.subplots(1, len(examples), squeeze=False)[0], examples, strict=True):
+            effect, observed = example.simulated.effect, example.observed
+            scene = Scene(
+                obj=example.subject.obj,
+                placement=example.subject.actions[example.contact].T_action_object,
+                times=effect.times,
+                pose=effect.pose_trajectory,
+                predictions={},
+                tool=effect.tool_trajectory,
+            )
+            draw_from_the_side(ax, scene, instants=3)
+            end = effect.slip_index
+            if observed.slip_time is not None:
+                slip = int(np.searchsorted(effect.times, observed.slip_time))
+                end = slip if end is None else min(end, slip)
+            paths = {
+                "stand-in": observed.com,
+                "predicted": example.imagined,
+                "simulated": effect.com_trajectory[:end],
+            }
+            for name, path in paths.items():
+                color, style, width = PATHS[name]
+                ax.plot(
+                    path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=5
+                )
+                ax.plot(path[-1:, 0] * CM, path[-1:, 2] * CM, "o", color=color, markersize=4.5, zorder=6)
+            slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
+            ax.set_title(f"{example.subject.name}, contact {example.contact + 1}{slipped}")
+            ax.grid(color=GRID, linewidth=0.6)
+            ax.set_axisbelow(True)
+        handles = [
+            Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
+            for name, (color, style, width) in PATHS.items()
+        ]
+        fig.legend(handles=handles, loc="outside lower center", ncols=3)
+        title = "Paths of the centre of mass from the side"
+        finish(
+            fig,
+            title,
+            "The object is drawn as simulated; the stand-in is Bullet with other constants, not a robot",
+        )
+    return fig

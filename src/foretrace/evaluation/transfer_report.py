@@ -1,0 +1,193 @@
+"""What the comparisons with the stand-in come to: a summary, and tables as the paper prints them."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from foretrace.interactions.record import Outcome
+
+PAPER_SIMULATED = {
+    "pentagon": (0.485, 0.520, 0.379, 0.385, 0.474),
+    "heptagon": (0.447, 0.910, 0.368, 0.333, 0.720, 0.864, 0.338),
+}
+"""Real against simulated, by edge [cm] (paper, tables 1 and 2)."""
+PAPER_PREDICTED = {
+    "pentagon": (0.981, 0.446, 0.480, 0.611, 0.401),
+    "heptagon": (0.601, 0.633, 0.460, 0.316, 0.531, 0.499, 0.471),
+}
+"""Real against predicted, by edge [cm]."""
+PAPER_OBJECTS = {"HDD": 0.123, "PCB": 0.344, "book": 0.415, "racket": 0.479}
+"""Real against predicted, by object [cm] (paper, figure 15)."""
+PAPER_BAR = 1.0
+"""The paper's distances of printed shapes all lie below this [cm]."""
+GOAL = 0.5
+"""The paper's distances of everyday objects all lie below this; here it is asked of printed shapes, too [cm]."""
+DISTANCES = {
+    "simulated": "distance_simulated_cm",
+    "predicted": "distance_predicted_cm",
+    "predicted_from_view": "distance_predicted_from_view_cm",
+}
+STATISTICS = {"mean": "mean", "sd": "standard deviation", "max": "largest"}
+NOTE = (
+    "The stand-in is no robot: it is another physics engine with other friction, density and thickness, errors of "
+    "contact, direction, camera and marker, and another sampling rate, all drawn anew for every lever-up. Distances in "
+    "cm: mean over the paths after dynamic time warping, up to where the object slips off the blade. The paper gives "
+    "one number for each edge or object, of a real robot."
+)
+
+
+def summarise(rows: pd.DataFrame) -> dict[str, Any]:
+    """Everything that the tables tell, JSON-able.
+
+    Args:
+        rows: As in `foretrace.evaluation.transfer.Transfer`.
+
+    Returns:
+        ``edges``: one entry for each edge of a printed shape; ``objects``: one for each other object; ``bars``: which
+        means and which single lever-ups lie below the bars; ``outcomes``: how often what happened.
+    """
+    printed, others = rows[rows["group"].eq("printed")], rows[rows["group"].ne("printed")]
+    edges = []
+    for (name, edge), part in printed.groupby(["object", "contact"], sort=False):
+        at = int(edge) - 1  # pyright: ignore[reportArgumentType]
+        paper = {
+            "simulated": _listed(PAPER_SIMULATED, str(name), at),
+            "predicted": _listed(PAPER_PREDICTED, str(name), at),
+        }
+        edges.append({"object": name, "edge": at + 1, "paper": paper, **_statistics(part)})
+    objects = []
+    for (group, name), part in others.groupby(["group", "object"], sort=False):
+        paper = PAPER_OBJECTS.get(str(name)) if group == "everyday" else None
+        contacts = int(part["contact"].nunique())
+        objects.append({"object": name, "group": group, "contacts": contacts, "paper": {"predicted": paper}})
+        objects[-1] |= _statistics(part)
+    everyday = [entry for entry in objects if entry["group"] == "everyday"]
+    bars = []
+    if edges:
+        bars += [_bar("every printed edge", edges, printed, bar) for bar in (PAPER_BAR, GOAL)]
+    if everyday:
+        bars.append(_bar("every everyday object", everyday, rows[rows["group"].eq("everyday")], GOAL))
+    return {"edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
+
+
+def _listed(numbers: Mapping[str, Sequence[float]], name: str, at: int) -> float | None:
+    values = numbers.get(name, ())
+    return values[at] if at < len(values) else None
+
+
+def _statistics(part: pd.DataFrame) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, column in DISTANCES.items():
+        values = part[column].dropna()
+        numbers = {
+            "mean": values.mean(),
+            "sd": values.std(),
+            "max": values.max(),
+        }
+        found[name] = {key: None if np.isnan(x) else round(float(x), 4) for key, x in numbers.items()}
+    return {**found, "outcomes": _counts(part)}
+
+
+def _counts(part: pd.DataFrame) -> dict[str, int]:
+    return {str(name): int(count) for name, count in part["outcome"].value_counts().items()}
+
+
+def _bar(what: str, entries: Sequence[Mapping[str, Any]], rows: pd.DataFrame, bar: float) -> dict[str, Any]:
+    """Whether all means and how many single lever-ups lie below a bar; a mean that is missing does not."""
+    result: dict[str, Any] = {"what": what, "below_cm": bar}
+    for name in ("predicted", "simulated"):
+        means = [entry[name]["mean"] for entry in entries]
+        result[name] = {
+            "holds": all(mean is not None and mean < bar for mean in means),
+            "means_below": sum(mean is not None and mean < bar for mean in means),
+            "means": len(means),
+            "share_of_lever_ups": round(float((rows[DISTANCES[name]] < bar).mean()), 4),
+        }
+    return result
+
+
+def bar_lines(summary: Mapping[str, Any]) -> list[str]:
+    """One sentence for each bar."""
+    lines = []
+    for bar in summary["bars"]:
+        for name in ("predicted", "simulated"):
+            found = bar[name]
+            lines.append(
+                f"{bar['what']} under {bar['below_cm']:g} cm on average, stand-in against {name}: "
+                f"{'yes' if found['holds'] else 'no'} ({found['means_below']} of {found['means']}; "
+                f"{100 * found['share_of_lever_ups']:.0f} % of the single lever-ups)"
+            )
+    return lines
+
+
+def markdown(summary: Mapping[str, Any], repeats: int) -> str:
+    """The paper's tables 1 and 2 and figure 15b with ours beside them."""
+    parts = ["# Predictions against a stand-in for the real robot", NOTE]
+    for number, name in enumerate(PAPER_PREDICTED, 1):
+        entries = [entry for entry in summary["edges"] if entry["object"] == name]
+        if entries:
+            heads = [f"Edge {entry['edge']}" for entry in entries]
+            title = f"## Table {number}: {name}, {repeats} lever-ups at each edge"
+            parts += [title, _table(heads, entries, ("simulated", "predicted"))]
+    for group, title in (
+        ("everyday", "Figure 15b: everyday objects"),
+        ("silhouettes", "Given silhouettes"),
+        ("prisms", "Given prisms"),
+    ):
+        entries = [entry for entry in summary["objects"] if entry["group"] == group]
+        if not entries:
+            continue
+        title = f"## {title}, {repeats} lever-ups at each of {entries[0]['contacts']} contacts"
+        parts.append(title)
+        if group == "everyday":
+            parts.append(_table([entry["object"] for entry in entries], entries, ("predicted", "simulated")))
+        else:
+            parts.append(_long_table(entries))
+    bars = "\n".join(f"- {line}" for line in bar_lines(summary))
+    return "\n\n".join([*parts, "## Bars", bars]) + "\n"
+
+
+def _table(heads: Sequence[str], entries: Sequence[Mapping[str, Any]], kinds: Iterable[str]) -> str:
+    """Columns as in the paper; rows from the paper and the stand-in."""
+    lines = [["", *heads]]
+    for kind in kinds:
+        word = {"simulated": "simulation", "predicted": "predicted"}[kind]
+        paper = [entry["paper"].get(kind) for entry in entries]
+        if any(value is not None for value in paper):
+            lines.append([f"Paper: real vs {word}", *map(_number, paper)])
+        lines += [
+            [f"Stand-in vs {word}, {words}", *(_number(entry[kind][key]) for entry in entries)]
+            for key, words in STATISTICS.items()
+        ]
+    blind = [_number(entry["predicted_from_view"]["mean"]) for entry in entries]
+    lines.append(["Start from the view instead of the marker, mean", *blind])
+    lines.append(["Not levered", *(_others(entry["outcomes"]) for entry in entries)])
+    return _rows(lines)
+
+
+def _long_table(entries: Sequence[Mapping[str, Any]]) -> str:
+    """A row for each object."""
+    words = list(STATISTICS.values())
+    lines = [
+        ["", *(f"vs {kind}, {word}" for kind in ("predicted", "simulation") for word in words), "Not levered"]
+    ]
+    for entry in entries:
+        numbers = [entry[kind][key] for kind in ("predicted", "simulated") for key in STATISTICS]
+        lines.append([entry["object"], *map(_number, numbers), _others(entry["outcomes"])])
+    return _rows(lines)
+
+
+def _rows(lines: Sequence[Sequence[str]]) -> str:
+    rule = ["---", *["---:"] * (len(lines[0]) - 1)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (lines[0], rule, *lines[1:]))
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _others(outcomes: Mapping[str, int]) -> str:
+    """How many lever-ups ended otherwise than on the blade."""
+    return ", ".join(f"{count} {name}" for name, count in outcomes.items() if name != Outcome.LEVERED) or "0"
