@@ -15,7 +15,7 @@ TABLE_BIT, OBJECT_BIT, TOOL_BIT = 1, 2, 4
 """Collision groups: the object meets table and tool; tool and arm meet only the object."""
 TOOL_COLLISION = {"contype": TOOL_BIT, "conaffinity": OBJECT_BIT}
 TOUCH_MARGIN = 0.001
-"""Blade and object closer than this count as touching [m]; contacts act only where they overlap."""
+"""Blade and object closer than this touch [m], and push: the blade acts as if it were so much thicker."""
 CARRIAGE_JOINTS = ("tool_x", "tool_z", "tool_pitch")
 CARRIAGE_INERTIA = (100.0, 100.0, 1.0)
 """Inertia of the carriage [kg, kg, kg m^2]: so heavy that no object disturbs its path."""
