@@ -69,6 +69,23 @@ def test_an_error_is_one_line_and_exit_status_2(folder, capsys):
     assert "no data set at" in capsys.readouterr().err
 
 
+def test_simulate_takes_recipes_and_watches_solids_longer(fake_physics, tmp_path, capsys):
+    begun = ["simulate", "--workers", "1", "--objects", "5", "--out"]
+    assert cli.main([*begun, str(tmp_path / "mixed"), "--recipe", "mixed", "--table-edge", "0.3"]) == 0
+    configuration = storage.read_manifest(tmp_path / "mixed")["configuration"]
+    assert configuration["recipe"] == "mixed"
+    assert configuration["simulation"]["watch_time"] == 1.5
+    assert configuration["simulation"]["physics"]["table_edge"] == 0.3
+    assert cli.main(["describe", str(tmp_path / "mixed")]) == 0
+    assert "cylinder: 8 levered" in capsys.readouterr().out
+    assert cli.main([*begun, str(tmp_path / "paper")]) == 0
+    assert storage.read_manifest(tmp_path / "paper")["configuration"]["simulation"]["watch_time"] == 0
+    capsys.readouterr()
+    for wrong in (["--table-edge", "-0.1"], ["--watch-time", "1000"]):
+        assert cli.main([*begun, str(tmp_path / "wrong"), "--recipe", "solids", *wrong]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_doctor_finds_repairs_and_tells_by_its_exit_status(folder, capsys):
     assert cli.main(["doctor", str(folder)]) == 0
     assert "104 interactions, no problems left" in capsys.readouterr().out

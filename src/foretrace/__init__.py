@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from foretrace.interactions.dataset import Dataset, InteractionBatch
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
-    from foretrace.objects import Bevel, MeshObject, Prism, paper_objects, sample_prism
+    from foretrace.objects import Bevel, Box, Cylinder, MeshObject, Prism, paper_objects, sample_prism
     from foretrace.predictor import TrainConfig, load_predictor, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig, simulate, simulate_lever_up
@@ -26,7 +26,7 @@ _HOMES = {
     "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
-    "foretrace.objects": ("Bevel", "MeshObject", "Prism", "paper_objects", "sample_prism"),
+    "foretrace.objects": ("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "paper_objects", "sample_prism"),
     "foretrace.predictor": ("TrainConfig", "load_predictor", "train_predictor"),
     "foretrace.simulation.collect": ("CollectConfig", "collect"),
     "foretrace.simulation.lever_up": ("SimulationConfig", "simulate", "simulate_lever_up"),
@@ -35,7 +35,9 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Bevel",
+    "Box",
     "CollectConfig",
+    "Cylinder",
     "Dataset",
     "Effect",
     "ForetraceError",
