@@ -1,6 +1,7 @@
 """Pictures of the comparisons with the stand-in: the paper's figure 15, and the last panel of its figure 14."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -28,7 +29,17 @@ from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
 BARS = {"predicted": ("distance_predicted_cm", VERMILLION), "simulated": ("distance_simulated_cm", BLUE)}
-PATHS = {"stand-in": (GREEN, "-", 2.4), "predicted": (VERMILLION, "--", 1.8), "simulated": (BLUE, "-.", 1.8)}
+PATHS: dict[str, tuple[str, Any, float]] = {
+    "stand-in": (GREEN, "-", 2.4),
+    "predicted": (VERMILLION, "--", 1.8),
+    "simulated": (BLUE, "-.", 1.8),
+}
+PAPER_MARK: dict[str, Any] = {
+    "color": INK, "marker": "D", "markersize": 7, "linestyle": "none", "markeredgecolor": "white", "zorder": 5
+}  # fmt: skip
+"""A number of the paper's."""
+PANEL = 10.0
+"""Width of what is shown around paths [cm]."""
 PER_ROW = 7
 """Masks side by side."""
 
@@ -48,10 +59,10 @@ def objects_figure(
     lines = -(-len(names) // columns)
     with mpl.rc_context(STYLE):
         width = max(8.6, 1.75 * columns)
-        fig = Figure(
-            figsize=(width, 1.0 + width / columns * lines * 0.95 + 3.4), dpi=DPI, layout="constrained"
-        )
-        above, below = fig.subfigures(2, 1, height_ratios=[width / columns * lines * 0.95, 3.4])
+        heights = [width / columns * lines * 0.95, 3.6]
+        fig = Figure(figsize=(width, 0.7 + sum(heights)), dpi=DPI, layout="constrained")
+        layout = fig.add_gridspec(2, 1, height_ratios=heights)
+        above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
         cells = above.subplots(lines, columns, squeeze=False).ravel()
         for ax, name in zip(cells, names, strict=False):
             draw_view(ax, [example for example in examples if example.subject.name == name])
@@ -66,6 +77,16 @@ def objects_figure(
             Line2D([], [], color=INK, marker="o", linestyle="none", markersize=4, label="other contacts"),
         ]
         above.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+        shown: list[Patch | Line2D] = [
+            Patch(facecolor=color, alpha=0.45, edgecolor=color, label=f"stand-in against {name}")
+            for name, (_, color) in BARS.items()
+        ]
+        if paper:
+            shown.append(Line2D([], [], label="paper: real against predicted", **PAPER_MARK))
+        note = "bars: mean and standard deviation; dots: single lever-ups"
+        below.legend(
+            handles=shown, loc="outside lower center", ncols=3, fontsize=8.5, title=note, title_fontsize=8.5
+        )
         title = "Objects as the predictor sees them, and the distance of its path from the stand-in's"
         finish(
             fig,
@@ -100,7 +121,7 @@ def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
         xlim=(middle[1] + half, middle[1] - half), ylim=(middle[0] - half, middle[0] + half), aspect="equal"
     )
     ax.set_title(first.subject.name, loc="center")
-    ax.set_xticks([]), ax.set_yticks([])
+    ax.set(xticks=[], yticks=[])
     ax.spines[["left", "bottom"]].set_visible(False)
     ax.plot(
         [middle[1] - half + 5.8, middle[1] - half + 0.8], [middle[0] - half + 0.6] * 2, color=INK, linewidth=2
@@ -111,40 +132,36 @@ def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
 def draw_errors(ax: Axes, rows: pd.DataFrame, names: Sequence[str], paper: Mapping[str, float]) -> None:
     """Mean and standard deviation for each object, every lever-up as a dot, the paper's value as a mark."""
     rng = np.random.default_rng(0)
+    labels = []
     for k, name in enumerate(names):
         mine = rows.loc[rows["object"].eq(name)]
-        for (column, color), shift in zip(BARS.values(), (-0.2, 0.2), strict=True):
+        labels.append(name)
+        for (kind, (column, color)), shift in zip(BARS.items(), (-0.2, 0.2), strict=True):
             values = mine[column].dropna().to_numpy(float)
             if len(values) == 0:
                 continue
-            ax.bar(k + shift, values.mean(), width=0.36, color=color, alpha=0.35, edgecolor=color)
+            ax.bar(k + shift, values.mean(), width=0.36, color=color, alpha=0.3, edgecolor=color)
             places = k + shift + rng.uniform(-0.12, 0.12, len(values))
             ax.plot(places, values, "o", color=color, markersize=2.6, alpha=0.7, markeredgewidth=0)
             if len(values) > 1:
-                ax.errorbar(
-                    k + shift, values.mean(), yerr=values.std(ddof=1), color=INK, capsize=3, linewidth=1.2
-                )
-        if name in paper:
-            ax.plot([k - 0.42, k + 0.02], [paper[name]] * 2, color=INK, linewidth=2.2, solid_capstyle="butt")
-            ax.text(
-                k - 0.44, paper[name], f"{paper[name]:.3f}", ha="right", va="center", fontsize=8, color=INK
-            )
-    grid(ax, ylabel="distance after time warping [cm]", xlim=(-0.75, len(names) - 0.5), ylim=(0, None))
-    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if len(names) > PER_ROW else {}
-    ax.set_xticks(range(len(names)), names, **turned)
+                sd = values.std(ddof=1)
+                ax.errorbar(k + shift, values.mean(), yerr=sd, color=color, capsize=3, linewidth=1.4)
+            if name in paper and kind == "predicted":
+                ax.plot(k + shift, paper[name], **PAPER_MARK)
+                labels[-1] += f"\n{values.mean():.2f} (paper {paper[name]:.2f})"
+    grid(ax, ylabel="distance after\ntime warping [cm]", xlim=(-0.6, len(names) - 0.4), ylim=(0, None))
+    many = len(names) > PER_ROW
+    ax.set_xticks(
+        range(len(names)),
+        labels,
+        rotation=35 if many else 0,
+        ha="right" if many else "center",
+        rotation_mode="anchor",
+    )
     ax.tick_params(axis="x", length=0)
-    handles: list[Patch | Line2D] = [
-        Patch(
-            facecolor=color,
-            alpha=0.45,
-            edgecolor=color,
-            label=f"stand-in against {name}: mean, sd, every lever-up",
-        )
-        for name, (_, color) in BARS.items()
-    ]
-    if paper:
-        handles.append(Line2D([], [], color=INK, linewidth=2.2, label="paper: real against predicted"))
-    ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3, fontsize=8.5)
+    if not many:
+        for label in ax.get_xticklabels():
+            label.set_verticalalignment("top")
 
 
 def paths_figure(examples: Sequence[Example]) -> Figure:
@@ -163,7 +180,6 @@ def paths_figure(examples: Sequence[Example]) -> Figure:
                 times=effect.times,
                 pose=effect.pose_trajectory,
                 predictions={},
-                tool=effect.tool_trajectory,
             )
             draw_from_the_side(ax, scene, instants=3)
             end = effect.slip_index
@@ -183,6 +199,10 @@ def paths_figure(examples: Sequence[Example]) -> Figure:
                 ax.plot(path[-1:, 0] * CM, path[-1:, 2] * CM, "o", color=color, markersize=4.5, zorder=6)
             slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
             ax.set_title(f"{example.subject.name}, contact {example.contact + 1}{slipped}")
+            seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
+            (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
+            middle = (left + right) / 2
+            ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
             ax.grid(color=GRID, linewidth=0.6)
             ax.set_axisbelow(True)
         handles = [

@@ -48,27 +48,30 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
         ``edges``: one entry for each edge of a printed shape; ``objects``: one for each other object; ``bars``: which
         means and which single lever-ups lie below the bars; ``outcomes``: how often what happened.
     """
-    printed, others = rows[rows["group"].eq("printed")], rows[rows["group"].ne("printed")]
-    edges = []
-    for (name, edge), part in printed.groupby(["object", "contact"], sort=False):
-        at = int(edge) - 1  # pyright: ignore[reportArgumentType]
+    edges: list[dict[str, Any]] = []
+    objects: list[dict[str, Any]] = []
+    printed = rows.loc[rows["group"].eq("printed")]
+    for name, edge in dict.fromkeys(zip(printed["object"], printed["contact"], strict=True)):
+        part = printed.loc[printed["object"].eq(name) & printed["contact"].eq(edge)]
         paper = {
-            "simulated": _listed(PAPER_SIMULATED, str(name), at),
-            "predicted": _listed(PAPER_PREDICTED, str(name), at),
+            "simulated": _listed(PAPER_SIMULATED, name, edge - 1),
+            "predicted": _listed(PAPER_PREDICTED, name, edge - 1),
         }
-        edges.append({"object": name, "edge": at + 1, "paper": paper, **_statistics(part)})
-    objects = []
-    for (group, name), part in others.groupby(["group", "object"], sort=False):
-        paper = PAPER_OBJECTS.get(str(name)) if group == "everyday" else None
-        contacts = int(part["contact"].nunique())
-        objects.append({"object": name, "group": group, "contacts": contacts, "paper": {"predicted": paper}})
-        objects[-1] |= _statistics(part)
+        edges.append({"object": name, "edge": int(edge), "paper": paper, **_statistics(part)})
+    others = rows.loc[rows["group"].ne("printed")]
+    for group, name in dict.fromkeys(zip(others["group"], others["object"], strict=True)):
+        part = others.loc[others["group"].eq(group) & others["object"].eq(name)]
+        paper = {"predicted": PAPER_OBJECTS.get(name) if group == "everyday" else None}
+        contacts = len(set(part["contact"]))
+        objects.append(
+            {"object": name, "group": group, "contacts": contacts, "paper": paper, **_statistics(part)}
+        )
     everyday = [entry for entry in objects if entry["group"] == "everyday"]
     bars = []
     if edges:
         bars += [_bar("every printed edge", edges, printed, bar) for bar in (PAPER_BAR, GOAL)]
     if everyday:
-        bars.append(_bar("every everyday object", everyday, rows[rows["group"].eq("everyday")], GOAL))
+        bars.append(_bar("every everyday object", everyday, rows.loc[rows["group"].eq("everyday")], GOAL))
     return {"edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
 
 
@@ -80,11 +83,11 @@ def _listed(numbers: Mapping[str, Sequence[float]], name: str, at: int) -> float
 def _statistics(part: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, column in DISTANCES.items():
-        values = part[column].dropna()
+        values = part[column].dropna().to_numpy(float)
         numbers = {
-            "mean": values.mean(),
-            "sd": values.std(),
-            "max": values.max(),
+            "mean": values.mean() if len(values) else np.nan,
+            "sd": values.std(ddof=1) if len(values) > 1 else np.nan,
+            "max": values.max() if len(values) else np.nan,
         }
         found[name] = {key: None if np.isnan(x) else round(float(x), 4) for key, x in numbers.items()}
     return {**found, "outcomes": _counts(part)}
@@ -103,7 +106,7 @@ def _bar(what: str, entries: Sequence[Mapping[str, Any]], rows: pd.DataFrame, ba
             "holds": all(mean is not None and mean < bar for mean in means),
             "means_below": sum(mean is not None and mean < bar for mean in means),
             "means": len(means),
-            "share_of_lever_ups": round(float((rows[DISTANCES[name]] < bar).mean()), 4),
+            "share_of_lever_ups": round(float(np.mean(rows[DISTANCES[name]].to_numpy(float) < bar)), 4),
         }
     return result
 
