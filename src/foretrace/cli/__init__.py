@@ -22,6 +22,7 @@ from foretrace.cli.figures import figures
 from foretrace.cli.learning import predict, train
 from foretrace.cli.reconstruction import evaluate_reconstruction
 from foretrace.cli.replay import evaluate_replay
+from foretrace.cli.transfer import evaluate_transfer
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Command | Group] = {
             "paper": evaluate_paper,
             "reconstruction": evaluate_reconstruction,
             "replay": evaluate_replay,
+            "transfer": evaluate_transfer,
         },
     ),
     "figures": figures,

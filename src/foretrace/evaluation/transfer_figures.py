@@ -17,12 +17,11 @@ from foretrace.evaluation.figures import (
     ARROW_LENGTH,
     CM,
     DPI,
+    GREY,
     INK,
     OBJECT_EDGE,
     STYLE,
     TOOL_COLOR,
-    Scene,
-    draw_from_the_side,
 )
 from foretrace.evaluation.transfer import Example
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
@@ -171,17 +170,9 @@ def paths_figure(examples: Sequence[Example]) -> Figure:
         examples: At most four of them look well.
     """
     with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(3.6 * len(examples), 3.9), dpi=DPI, layout="constrained")
+        fig = Figure(figsize=(3.4 * len(examples), 4.3), dpi=DPI, layout="constrained")
         for ax, example in zip(fig.subplots(1, len(examples), squeeze=False)[0], examples, strict=True):
             effect, observed = example.simulated.effect, example.observed
-            scene = Scene(
-                obj=example.subject.obj,
-                placement=example.subject.actions[example.contact].T_action_object,
-                times=effect.times,
-                pose=effect.pose_trajectory,
-                predictions={},
-            )
-            draw_from_the_side(ax, scene, instants=3)
             end = effect.slip_index
             if observed.slip_time is not None:
                 slip = int(np.searchsorted(effect.times, observed.slip_time))
@@ -203,6 +194,9 @@ def paths_figure(examples: Sequence[Example]) -> Figure:
             (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
             middle = (left + right) / 2
             ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
+            ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
+            ax.axhspan(-1, 0, color="#f1f2f4", zorder=-1)
+            ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
             ax.grid(color=GRID, linewidth=0.6)
             ax.set_axisbelow(True)
         handles = [
@@ -214,6 +208,6 @@ def paths_figure(examples: Sequence[Example]) -> Figure:
         finish(
             fig,
             title,
-            "The object is drawn as simulated; the stand-in is Bullet with other constants, not a robot",
+            "The stand-in is Bullet with other constants and errors, not a robot; the table is grey",
         )
     return fig
