@@ -247,10 +247,11 @@ def hull_of(view: TopDownView) -> TopDownView:
     rows, columns = np.nonzero(view.mask)
     if len(rows) == 0:
         raise ViewError("the view's mask is empty: it has no hull")
-    hull = cv2.convexHull(np.column_stack([columns, rows]).astype(np.int32))[:, 0]
+    hull = cv2.convexHull(np.column_stack([columns, rows]).astype(np.int32))[:, 0].astype(float)
     ahead = np.roll(hull, -1, axis=0) - hull
-    pixels = np.stack(np.meshgrid(np.arange(view.mask.shape[1]), np.arange(view.mask.shape[0])), axis=-1)
-    # In whole numbers, so that a mask that is convex already stays as it is.
+    grid = np.meshgrid(np.arange(view.mask.shape[1]), np.arange(view.mask.shape[0]))
+    pixels = np.stack(grid, axis=-1).astype(float)
+    # Whole numbers are exact, so that a mask that is convex already stays as it is.
     sides = cross(ahead, pixels[..., None, :] - hull)  # (row, column, side of the hull)
     mask = np.asarray((sides >= 0).all(axis=-1) | (sides <= 0).all(axis=-1))
     return TopDownView(mask, np.where(mask, view.height.max(), np.float32(0)), view.metres_per_pixel)

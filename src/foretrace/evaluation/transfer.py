@@ -6,7 +6,6 @@ the contact as it was told, and with the imagined path. Paths are compared as in
 after dynamic time warping. Where the object slips off the blade, both end: afterwards nothing is predicted.
 """
 
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -19,25 +18,15 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from foretrace.errors import ForetraceError, PredictionError, ShapeError, SimulationError
+from foretrace.errors import PredictionError, ShapeError, SimulationError
 from foretrace.evaluation.stand_in import Observation, StandIn, hull_of
-from foretrace.evaluation.transfer_objects import Subject
+from foretrace.evaluation.transfer_objects import Played, Subject, play
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor.base import EffectPredictor
-from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.trajectories import warped_distance
 
 CM = 100.0
-
-
-class Played(NamedTuple):
-    """One contact of one object: as the simulator of the training data has it, and as the stand-in has it."""
-
-    simulated: Interaction
-    """What the simulator makes of the lever-up as told."""
-    observed: tuple[Observation, ...]
-    """What the stand-in shows, once for each repetition."""
 
 
 class Example(NamedTuple):
@@ -119,25 +108,6 @@ def evaluate_transfer(
             if repetition == 0:
                 examples.append(Example(subject, contact, view, played.simulated, observed, imagined))
     return Transfer(pd.DataFrame(rows), examples)
-
-
-def play(subject: Subject, contact: int, stand_in: StandIn, repeats: int, seed: int) -> Played:
-    """Play one contact of a subject, once in the simulator of the training data and several times by the stand-in.
-
-    Raises:
-        ShapeError: The object does not fit in the view, or is too thin for its bevel.
-    """
-    action = subject.actions[contact]
-    stream = zlib.crc32(f"{subject.group}/{subject.name}".encode())
-    try:
-        simulated = simulate_lever_up(subject.obj, action, SimulationConfig())
-        observed = [
-            stand_in.observe(subject.obj, action, stand_in.draw(rng), subject.density)
-            for rng in (np.random.default_rng([seed, stream, contact, k]) for k in range(repeats))
-        ]
-    except ForetraceError as error:
-        raise ShapeError(f"{subject.name}, contact {contact + 1}: {error}") from error
-    return Played(simulated, tuple(observed))
 
 
 def compare(

@@ -170,7 +170,7 @@ def paths_figure(examples: Sequence[Example]) -> Figure:
         examples: At most four of them look well.
     """
     with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(3.4 * len(examples), 4.3), dpi=DPI, layout="constrained")
+        fig = Figure(figsize=(3.4 * len(examples), 4.9), dpi=DPI, layout="constrained")
         for ax, example in zip(fig.subplots(1, len(examples), squeeze=False)[0], examples, strict=True):
             effect, observed = example.simulated.effect, example.observed
             end = effect.slip_index

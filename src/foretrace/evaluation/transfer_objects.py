@@ -2,25 +2,29 @@
 
 The paper prints a pentagon and a heptagon (tables 1 and 2) and takes a book, a PCB, an HDD and a table-tennis racket
 (figure 15); it tells no dimensions. Those here are of usual sizes. All are slabs with a bevelled lower rim.
+
+Nothing here needs torch: worker processes start with this module.
 """
 
 import json
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Float
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, ShapeError
+from foretrace.evaluation.stand_in import Observation, StandIn
 from foretrace.geometry import convex_hull, inward_normals
-from foretrace.interactions.record import Physics
+from foretrace.interactions.record import Interaction, Physics
 from foretrace.objects import CIRCLE_RADIUS, Prism, read_silhouette
 from foretrace.objects.model import fitting_bevel
+from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
 Group = Literal["printed", "everyday", "silhouettes", "prisms"]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -54,8 +58,17 @@ class Subject:
     """Whether the predictor sees the convex hull of its mask (paper, figure 15)."""
 
 
-def on_circle(degrees: Sequence[float]) -> Prism:
-    """A prism with corners at given angles on the circle that the paper's objects have theirs on."""
+class Played(NamedTuple):
+    """One contact of one object: as the simulator of the training data has it, and as the stand-in has it."""
+
+    simulated: Interaction
+    """What the simulator makes of the lever-up as told."""
+    observed: tuple[Observation, ...]
+    """What the stand-in shows, once for each repetition."""
+
+
+def on_circle(degrees: Sequence[int]) -> Prism:
+    """A prism with corners at given angles [deg] on the circle that the paper's objects have theirs on."""
     angles = np.deg2rad(np.asarray(degrees, dtype=float))
     return Prism(CIRCLE_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)]))
 
@@ -150,6 +163,25 @@ def contacts_around(obj: Prism, count: int) -> tuple[LeverUp, ...]:
     return tuple(actions)
 
 
+def play(subject: Subject, contact: int, stand_in: StandIn, repeats: int, seed: int) -> Played:
+    """Play one contact of a subject, once in the simulator of the training data and several times by the stand-in.
+
+    Raises:
+        ShapeError: The object does not fit in the view, or is too thin for its bevel.
+    """
+    action = subject.actions[contact]
+    stream = zlib.crc32(f"{subject.group}/{subject.name}".encode())
+    try:
+        simulated = simulate_lever_up(subject.obj, action, SimulationConfig())
+        observed = [
+            stand_in.observe(subject.obj, action, stand_in.draw(rng), subject.density)
+            for rng in (np.random.default_rng([seed, stream, contact, k]) for k in range(repeats))
+        ]
+    except ForetraceError as error:
+        raise ShapeError(f"{subject.name}, contact {contact + 1}: {error}") from error
+    return Played(simulated, tuple(observed))
+
+
 def read_silhouettes(
     folder: Path, size: float = 0.18, scale: float | None = None, height: float = GIVEN_HEIGHT
 ) -> list[Subject]:
@@ -217,9 +249,3 @@ def read_prisms(file: Path, height: float = GIVEN_HEIGHT) -> list[Subject]:
         except ForetraceError as error:
             raise ShapeError(f"{file}: {name}: {error}") from error
     return subjects
-
-
-def outline_in_action(subject: Subject, contact: int) -> Float[np.ndarray, "n 2"]:
-    """A subject's outline at rest in the frame of one of its actions [m]."""
-    T = subject.actions[contact].T_action_object
-    return subject.obj.corners @ T[:2, :2].T + T[:2, 3]

@@ -165,7 +165,7 @@ def _table(heads: Sequence[str], entries: Sequence[Mapping[str, Any]], kinds: It
             for key, words in STATISTICS.items()
         ]
     blind = [_number(entry["predicted_from_view"]["mean"]) for entry in entries]
-    lines.append(["Start from the view instead of the marker, mean", *blind])
+    lines.append(["Stand-in vs predicted from the view alone, mean", *blind])
     lines.append(["Not levered", *(_others(entry["outcomes"]) for entry in entries)])
     return _rows(lines)
 
