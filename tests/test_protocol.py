@@ -38,6 +38,7 @@ TRIALS = [
     *plan(["support-points", "support-points-novel"], settings=["5", "50", "3&4"], seeds=[0]),
     *plan(["features", "half-plane"], seeds=[0]),
     *plan(["training-size", "steps-ahead", "novel-corners"], FEW, seeds=[0]),
+    *plan(["support-points-plain"], ["sp-rule"], seeds=[0]),
 ]
 """Something of every experiment."""
 ERRORS = {"full", "final", "full_median", "final_median", "best_epoch", "epochs", "seconds"}
