@@ -55,7 +55,7 @@ def views() -> Tensor:
 
     prism = Prism([[-0.1, 0.0], [0.03, -0.095], [0.1, 0.0], [-0.03, 0.095]], 0.02)
     mask = TopDownView.of(prism, LeverUp.at_edge(prism, 0, 0.5)).mask
-    return torch.from_numpy(mask).to(torch.uint8).expand(BATCH, 1, -1, -1).contiguous()
+    return torch.tensor(mask).to(torch.uint8).expand(BATCH, 1, -1, -1).contiguous()
 
 
 def plain_step(label: str, config: LstmConfig) -> Callable[[], None]:
