@@ -8,9 +8,10 @@ from foretrace.features.windows import convolve_windows, crop, find_windows, pas
 @pytest.fixture(scope="module")
 def images():
     """An object at the right rim, one in the middle, one too wide for a window, nothing, and everything."""
-    images = torch.zeros(5, 1, 128, 128)
-    images[0, 0, 33:96, 100:128] = torch.rand(63, 28) + 0.1
-    images[1, 0, 40:96, 30:90] = torch.rand(56, 60) + 0.1
+    torch.manual_seed(0)
+    images = torch.zeros(5, 1, 128, 128)  # whole numbers, whose sums are exact
+    images[0, 0, 33:96, 100:128] = torch.randint(1, 9, (63, 28)).float()
+    images[1, 0, 40:96, 30:90] = torch.randint(1, 9, (56, 60)).float()
     images[2, 0, 60:70, 5:125] = 1
     images[4] = 1
     return images
