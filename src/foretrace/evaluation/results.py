@@ -20,7 +20,7 @@ import torch
 import foretrace
 from foretrace.errors import DatasetError, ResultsError
 from foretrace.interactions.storage import sole_writer, write_atomically
-from foretrace.predictor.run_folder import git_commit
+from foretrace.predictor.run_folder import flatten, git_commit
 
 FORMAT = "foretrace-results"
 FORMAT_VERSION = 1
@@ -161,7 +161,7 @@ def finished_trials(folder: str | Path, identity: Mapping[str, Any]) -> set[Tria
                 "or choose another"
             )
         return set()
-    found, wanted = (_flat(content["identity"]) for content in (description, _describe(identity)))
+    found, wanted = (flatten(content["identity"]) for content in (description, _describe(identity)))
     for name in sorted(found.keys() | wanted.keys()):
         if found.get(name) != wanted.get(name):
             raise ResultsError(
@@ -265,14 +265,6 @@ def _format(trials: Mapping[Trial, Mapping[str, float]]) -> str:
         start = ",".join(map(str, trial))
         lines += [f"{start},{name},{float(metrics[name])!r}\n" for name in names]
     return "".join(lines)
-
-
-def _flat(nested: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as one level, names joined by dots."""
-    flat: dict[str, Any] = {}
-    for name, value in nested.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-    return flat
 
 
 def _now() -> str:

@@ -99,9 +99,7 @@ class AutoencoderFeatures(FeatureExtractor):
             min_steps=min_steps,
             width=width,
         )
-        self.config = FitConfig(
-            epochs, batch_size, learning_rate, patience=10**9, annealed=True, min_steps=min_steps
-        )
+        self.config = FitConfig(epochs, batch_size, learning_rate, annealed=True, min_steps=min_steps)
         self.network = Autoencoder(width, self.code_channels).requires_grad_(False)
         self.register_buffer("code_scale", torch.ones(()))
 

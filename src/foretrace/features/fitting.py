@@ -27,17 +27,17 @@ class FitConfig:
     """Rows per optimiser step."""
     learning_rate: float
     """Adam's learning rate."""
-    patience: int
-    """Epochs without a smaller validation loss after which the training stops."""
+    patience: int | None = None
+    """Epochs without a smaller validation loss after which the training stops; None: it runs to its end."""
     annealed: bool = False
     """Whether the learning rate rises and falls as in `learning_rate`, instead of staying the same."""
     min_steps: int = 1
     """Optimiser steps, at least: few rows are passed over more often."""
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size", "patience"):
-            if getattr(self, name) < 1:
-                raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("epochs", "batch_size", "patience", "min_steps"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise TrainingError(f"{name} must be at least 1, not {value}")
         if not self.learning_rate > 0:
             raise TrainingError(f"learning_rate must be positive, not {self.learning_rate}")
 
@@ -93,7 +93,7 @@ def fit_network(
             if loss < best:
                 best, best_epoch = loss, epoch
                 kept = {key: tensor.clone() for key, tensor in network.state_dict().items()}
-            elif epoch - best_epoch >= config.patience:
+            elif config.patience is not None and epoch - best_epoch >= config.patience:
                 break
             if epoch % -(-epochs // NUM_REPORTS) == 0:
                 report(f"{name}: epoch {epoch} of {epochs}, best validation loss {best:.3g}")

@@ -101,7 +101,7 @@ class RunFolder:
         write_json(self.path / CONFIG, config)
 
     def _check(self, config: Mapping[str, Any]) -> None:
-        found, wanted = _flat(read_config(self.path)), _flat(config)
+        found, wanted = flatten(read_config(self.path)), flatten(config)
         for name in sorted(found.keys() | wanted.keys()):
             if found.get(name) != wanted.get(name):
                 raise TrainingError(
@@ -212,11 +212,12 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
     return batch[rows]
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level, names joined by dots."""
     flat: dict[str, Any] = {}
     for name, value in config.items():
         if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
+            flat |= flatten(value, f"{prefix}{name}.")
         else:
             flat[prefix + name] = value
     return flat
