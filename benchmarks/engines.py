@@ -18,7 +18,8 @@ from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.record import Effect, Outcome
 from foretrace.simulation import mujoco_engine, tool
 from foretrace.simulation.collect import CollectConfig, num_trials, trial
-from foretrace.simulation.free_motion import ENGINES, Body, Surroundings, simulate_free_motion
+from foretrace.simulation.engine import ENGINES
+from foretrace.simulation.free_motion import Body, Surroundings, simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
 
 G = 9.81

@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from foretrace.simulation.lever_up import ENGINES
+from foretrace.simulation.engine import ENGINES
 
 WITHOUT_BULLET = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
 every_engine = pytest.mark.parametrize(

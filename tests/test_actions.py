@@ -110,3 +110,9 @@ def test_nearest_finds_sampled_contacts_again():
     for action in sample_contacts(prism, np.random.default_rng(4)):
         found = LeverUp.nearest(prism, action.contact)
         assert np.linalg.norm(found.contact - action.contact) < CORNER_MARGIN * 1.5
+
+
+def test_moved_actions():
+    action = LeverUp((0.0, 0.0), (0.0, 1.0)).moved(ahead=0.003, left=0.001, turn=np.pi / 2)
+    np.testing.assert_allclose(action.contact, [-0.001, 0.003], atol=1e-12)
+    np.testing.assert_allclose(action.direction, [-1.0, 0.0], atol=1e-12)

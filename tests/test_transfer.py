@@ -15,7 +15,7 @@ from foretrace.actions import LeverUp
 from foretrace.cli import main
 from foretrace.errors import PredictionError, ShapeError, SimulationError, ViewError
 from foretrace.evaluation import transfer_objects
-from foretrace.evaluation.stand_in import Observation, Perturbation, StandIn, hull_of, moved
+from foretrace.evaluation.stand_in import Observation, Perturbation, StandIn, hull_of
 from foretrace.evaluation.transfer import distance_until_slip, evaluate_transfer
 from foretrace.evaluation.transfer_objects import (
     HEPTAGON,
@@ -107,12 +107,6 @@ def test_the_blade_errs_but_what_is_seen_stays_in_the_told_frame() -> None:
     np.testing.assert_array_equal(right.view.mask, erring.view.mask)
     size = min(len(right.com), len(erring.com))
     assert np.linalg.norm(right.com[:size] - erring.com[:size], axis=1).max() > 5e-4
-
-
-def test_moved_actions() -> None:
-    action = moved(LeverUp((0.0, 0.0), (0.0, 1.0)), ahead=0.003, left=0.001, turn=np.pi / 2)
-    np.testing.assert_allclose(action.contact, [-0.001, 0.003], atol=1e-12)
-    np.testing.assert_allclose(action.direction, [-1.0, 0.0], atol=1e-12)
 
 
 def test_the_mask_is_shifted_and_frayed_by_as_much_as_told() -> None:

@@ -94,6 +94,13 @@ class LeverUp:
                 "take LeverUp.nearest or LeverUp.at_edge"
             )
 
+    def moved(self, ahead: float, left: float, turn: float) -> "LeverUp":
+        """The action shifted along its direction and to its left [m], then turned to the left [rad]."""
+        x, y = self.direction
+        contact = self.contact + ahead * np.array([x, y]) + left * np.array([-y, x])
+        c, s = np.cos(turn), np.sin(turn)
+        return LeverUp(contact, np.array([c * x - s * y, s * x + c * y]))
+
     @property
     def T_action_object(self) -> Float[np.ndarray, "4 4"]:
         """Transform from the object frame at rest to the action frame.

@@ -24,6 +24,7 @@ def simulate(
     recipe: Literal["paper", "solids", "mixed"] = "paper",
     watch_time: float | None = None,
     table_edge: float | None = None,
+    randomise: bool = False,
 ) -> None:
     """Simulate lever-ups of many objects into a data set.
 
@@ -45,10 +46,13 @@ def simulate(
             and 1.5 for solids, which may roll.
         table_edge: Distance of the table's edge ahead of the contact point, in metres: objects can fall off. By
             default no edge is within reach.
+        randomise: Draw friction, density, thickness and bevel anew for every lever-up, and let the blade err in
+            place and direction. Objects, contact points and what is told of them stay the same.
     """
     from foretrace.interactions.record import Physics
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig
+    from foretrace.simulation.randomisation import NOTHING, RANDOMISED
 
     if watch_time is None:
         watch_time = 0.0 if recipe == "paper" else ROLLING_TIME
@@ -59,7 +63,9 @@ def simulate(
         watch_time=watch_time,
         physics=Physics(table_edge=table_edge),
     )
-    config = CollectConfig(objects, contacts_per_edge, seed, simulation, recipe)
+    config = CollectConfig(
+        objects, contacts_per_edge, seed, simulation, recipe, RANDOMISED if randomise else NOTHING
+    )
     try:
         counts = collect(config, out, workers)
     except KeyboardInterrupt:
@@ -139,6 +145,8 @@ def describe(path: Positional[Path], out: Path | None = None) -> None:
     if len(kinds := figures["outcomes_by_kind"]) > 1:
         for kind, counts in kinds.items():
             print(f"{kind:>10}: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    for name, (low, high) in figures["varies"].items():
+        print(f"{name.replace('_', ' '):>42} {low:10.4g} to {high:.4g}")
     for name, value in figures.items():
         if not isinstance(value, dict) and name != "interactions":
             print(f"{name.replace('_', ' '):>42} {value:10.4g}")

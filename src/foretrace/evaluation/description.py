@@ -10,6 +10,8 @@ from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
 
 CM, MM = 100.0, 1000.0
+VARIABLE = ("density", "friction", "tool_friction", "misplaced_ahead", "misplaced_left", "misplaced_turn")
+"""Columns that may be drawn anew for every interaction."""
 
 
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
@@ -19,7 +21,9 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         dataset: The interactions.
 
     Returns:
-        ``outcomes`` (counts), ``outcomes_by_kind`` (the same for each kind of object), ``interactions``,
+        ``outcomes`` (counts), ``outcomes_by_kind`` (the same for each kind of object), ``interactions``, ``varies``
+        (least and greatest value of what is not the same in all interactions: constants, misplacement, height and
+        bevel; SI units),
         ``fell_off_the_table`` (count), ``median_rolled_cm`` (distance that the rolled ones went, if there are any), and
         for the levered ones: ``median_final_tilt_deg``,
         ``median_final_rise_cm`` of the centre of mass, ``median_slide_mm`` of the centre of mass along the table before
@@ -29,11 +33,13 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     """
     levered = dataset.where(outcome=str(Outcome.LEVERED))
     rows = [_describe(levered[k]) for k in range(len(levered))]
-    kinds = np.array([json.loads(text)["kind"] for text in dataset.table["object"].to_pylist()])
+    objects = [json.loads(text) for text in dataset.table["object"].to_pylist()]
+    kinds = np.array([obj["kind"] for obj in objects])
     figures: dict[str, Any] = {
         "outcomes": dataset.outcomes(),
         "outcomes_by_kind": {str(kind): dataset[kinds == kind].outcomes() for kind in np.unique(kinds)},
         "interactions": len(dataset),
+        "varies": _ranges(dataset, objects),
         "fell_off_the_table": dataset.table["fall_index"].drop_null().length(),
     }
     if rolled := list(dataset.where(outcome=str(Outcome.ROLLED))):
@@ -50,6 +56,19 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         "largest_path_error_mm": float(error.max()),
         "two_support_corners": float(two.mean()),
         "rule_agreement": float(right[two > 0].mean()) if two.any() else float("nan"),
+    }
+
+
+def _ranges(dataset: Dataset, objects: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
+    """Least and greatest value of each quantity that is not the same in all interactions."""
+    columns = {name: dataset.table[name].to_numpy() for name in VARIABLE}
+    columns["height"] = np.array([obj["height"] for obj in objects if "height" in obj])
+    bevels = np.array([obj["bevel"] for obj in objects if "bevel" in obj]).reshape(-1, 2)
+    columns["bevel_width"], columns["bevel_height"] = bevels.T
+    return {
+        name: (float(values.min()), float(values.max()))
+        for name, values in columns.items()
+        if len(values) and values.min() < values.max()
     }
 
 

@@ -16,14 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from foretrace.actions import CONTACT_TOLERANCE, LeverUp
 from foretrace.errors import SimulationError, ViewError
-from foretrace.geometry import cross, invert_transform, pose_to_matrix, transform_points
-from foretrace.interactions.record import Effect, Outcome, Physics
+from foretrace.geometry import cross, pose_to_matrix, transform_points
+from foretrace.interactions.record import Effect, Misplacement, Outcome, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Prism
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.randomisation import Range
 
-Range = tuple[float, float]
-"""Least and greatest value of what is drawn uniformly."""
 LONGEST_STEP = 0.002
 """Time steps of the physics are at most about so long [s]."""
 
@@ -163,14 +162,13 @@ class StandIn:
         """
         drawn = perturbation
         real = Prism(obj.corners, obj.height + drawn.thickness_error, obj.bevel)
-        done = moved(action, drawn.contact_across, drawn.contact_along, drawn.direction_error)
+        misplaced = Misplacement(drawn.contact_across, drawn.contact_along, drawn.direction_error)
         physics = Physics(density * drawn.density_factor, drawn.friction, drawn.tool_friction)
         rng = np.random.default_rng(drawn.noise_seed)
         view = self._see(real, action, drawn, rng)
-        effect = simulate_lever_up(real, done, self.simulation(physics)).effect
-        # Everything is told in the frame in which the robot believes to act.
-        T_told_done = action.T_action_object @ invert_transform(done.T_action_object)
-        com = self._track(real, T_told_done, effect, rng)
+        simulation = self.simulation(physics)
+        effect = simulate_lever_up(real, action, simulation, misplacement=misplaced).effect
+        com = self._track(real, effect, rng)
         end = len(com) if effect.slip_index is None else effect.slip_index
         return Observation(
             view=view,
@@ -186,7 +184,7 @@ class StandIn:
     ) -> TopDownView:
         """The object from above, in the told action frame, as a camera with small errors shows it."""
         # The mask shifts one way where its frame shifts the other way.
-        wrong = moved(action, -drawn.view_shift_x, -drawn.view_shift_y, -drawn.view_turn)
+        wrong = action.moved(-drawn.view_shift_x, -drawn.view_shift_y, -drawn.view_turn)
         exact = TopDownView.of(real, wrong)
         mask = exact.mask.astype(np.uint8)
         cross_shape = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -194,21 +192,14 @@ class StandIn:
         mask = exact.mask ^ (border & (rng.random(border.shape) < self.frayed))
         return TopDownView(mask, np.where(mask, np.float32(real.height), np.float32(0)))
 
-    def _track(
-        self,
-        real: Prism,
-        T_told_done: Float[np.ndarray, "4 4"],
-        effect: Effect,
-        rng: np.random.Generator,
-    ) -> Float[np.ndarray, "time 3"]:
+    def _track(self, real: Prism, effect: Effect, rng: np.random.Generator) -> Float[np.ndarray, "time 3"]:
         """Centres of mass in the told action frame [m], from noisy poses of a marker on top of the object."""
         centre = real.mass_properties(1.0).com
         marker = np.array([centre[0], centre[1], real.height])
         count = len(effect.times)
         turns = Rotation.from_rotvec(rng.normal(0, self.marker_rotation, (count, 3))).as_matrix()
         seen = marker + turns @ (centre - marker)  # (time, 3), object frame
-        T = T_told_done @ pose_to_matrix(effect.pose_trajectory)
-        com = transform_points(T, seen[:, None])[:, 0]
+        com = transform_points(pose_to_matrix(effect.pose_trajectory), seen[:, None])[:, 0]
         return com + rng.normal(0, self.marker_position, (count, 3))
 
 
@@ -228,14 +219,6 @@ class Observation:
     """What became of the object."""
     perturbation: Perturbation
     """What was different."""
-
-
-def moved(action: LeverUp, ahead: float, left: float, turn: float) -> LeverUp:
-    """An action shifted along its direction and to its left [m], then turned to the left [rad]."""
-    x, y = action.direction
-    contact = action.contact + ahead * np.array([x, y]) + left * np.array([-y, x])
-    c, s = np.cos(turn), np.sin(turn)
-    return LeverUp(contact, np.array([c * x - s * y, s * x + c * y]))
 
 
 def hull_of(view: TopDownView) -> TopDownView:

@@ -71,6 +71,7 @@ def _examine(path: Path, repair: bool) -> Diagnosis:
             continue
         tables[name] = table
         findings += _unsound_numbers(name, table)
+        findings += _out_of_range(name, table, manifest)
         if "sha256" not in entry:
             findings.append(Finding(name, "no checksum in the manifest (an interrupted run)", repair))
             if repair:
@@ -130,6 +131,18 @@ def _unsound_numbers(name: str, table: pa.Table) -> Iterator[Finding]:
             yield Finding(name, f"{who}: {', '.join(unknown)} is not a number")
         if np.any(np.diff(row["times"]) <= 0):
             yield Finding(name, f"{who}: its times do not rise")
+
+
+def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Finding]:
+    """What is drawn anew for every interaction, outside of the range that the configuration gives."""
+    for column, drawn in (manifest["configuration"].get("randomisation") or {}).items():
+        if column not in table.column_names or drawn is None:
+            continue
+        low, high = (-drawn, drawn) if np.isscalar(drawn) else drawn
+        values = table[column].to_numpy()
+        for row in np.flatnonzero((values < low) | (values > high)):
+            who = f"interaction {table['id'][int(row)]}"
+            yield Finding(name, f"{who}: {column} = {values[row]:g} was not drawn from {low:g} to {high:g}")
 
 
 def _unsound_ids(tables: dict[str, pa.Table], manifest: dict) -> Iterator[Finding]:

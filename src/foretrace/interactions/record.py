@@ -78,6 +78,25 @@ class Physics:
 
 
 @dataclass(frozen=True)
+class Misplacement:
+    """Where the blade really acted, seen from where it was told to: as `LeverUp.moved`.
+
+    View, action and effect are in the frame that was told, the one in which the robot believes to act.
+    """
+
+    ahead: float = 0.0
+    """How far ahead along the action [m]."""
+    left: float = 0.0
+    """How far to the left [m]."""
+    turn: float = 0.0
+    """By how much it pointed to the left [rad]."""
+
+
+AS_TOLD = Misplacement()
+"""No misplacement."""
+
+
+@dataclass(frozen=True)
 class Provenance:
     """Where an interaction comes from, enough to make it again."""
 
@@ -100,7 +119,7 @@ class Interaction:
     object: ObjectModel
     """The object, in its own frame."""
     action: LeverUp
-    """What was done, in the object frame."""
+    """What was done, in the object frame; of a misplaced lever-up, what was told."""
     view: TopDownView
     """The object seen from above before the action, in the action frame."""
     effect: Effect
@@ -109,5 +128,7 @@ class Interaction:
     """Friction and density."""
     provenance: Provenance = Provenance()
     """Where it comes from."""
+    misplacement: Misplacement = AS_TOLD
+    """How far from what was told the blade acted."""
     id: int = 0
     """Number within its data set."""

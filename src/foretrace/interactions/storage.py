@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError
-from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
+from foretrace.interactions.record import Effect, Interaction, Misplacement, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
 
@@ -35,7 +35,7 @@ HEIGHT_STEP = 1e-4
 _FLOATS = pa.list_(pa.float64())
 COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "id": (pa.int64(), "", "number of the interaction within its data set"),
-    "object_id": (pa.int64(), "", "equal numbers are the same object"),
+    "object_id": (pa.int64(), "", "equal numbers are the same object; its thickness and bevel may vary"),
     "num_corners": (pa.int64(), "", "corners of the object's outline"),
     "object": (pa.string(), "m", "the object in its own frame, as JSON"),
     "contact": (_FLOATS, "m", "contact point in the object frame (2)"),
@@ -60,6 +60,9 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "tool_friction": (pa.float64(), "", "friction coefficient between object and blade"),
     "rolling_friction": (pa.float64(), "m", "lever arm of the resistance to rolling of a round object"),
     "table_edge": (pa.float64(), "m", "distance of the table's edge ahead of the contact point, or null"),
+    "misplaced_ahead": (pa.float64(), "m", "how far ahead of the told contact the blade acted"),
+    "misplaced_left": (pa.float64(), "m", "how far to the left of it"),
+    "misplaced_turn": (pa.float64(), "rad", "by how much the blade pointed to the left of what was told"),
     "source": (pa.string(), "", "simulated or recorded"),
     "engine": (pa.string(), "", "physics engine, empty for a recording"),
     "embodiment": (pa.string(), "", "arm or tool"),
@@ -71,11 +74,16 @@ ADDED_COLUMNS: dict[str, Any] = {
     "fall_index": None,
     "rolling_friction": Physics.rolling_friction,
     "table_edge": None,
+    "misplaced_ahead": 0.0,
+    "misplaced_left": 0.0,
+    "misplaced_turn": 0.0,
 }
 """Columns that older data sets lack, and what they would hold there."""
 OPTIONAL_COLUMNS = ("slip_index", "fall_index", "table_edge")
 """Numbers that may be null."""
 PHYSICS_COLUMNS = tuple(field.name for field in fields(Physics))
+MISPLACED = "misplaced_"
+"""How the columns of a `Misplacement` begin."""
 SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
 TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
 """Numbers per sample of each trajectory column; the joints' count is a column of its own."""
@@ -109,6 +117,7 @@ def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
         "height": np.rint(np.clip(view.height / HEIGHT_STEP, 0, 65535)).astype("<u2").tobytes(),
         "metres_per_pixel": view.metres_per_pixel,
         **asdict(interaction.physics),
+        **{MISPLACED + name: value for name, value in asdict(interaction.misplacement).items()},
         **asdict(interaction.provenance),
         "versions": json.dumps(interaction.provenance.versions, sort_keys=True),
     }
@@ -143,6 +152,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
             **{name: row[name] for name in ("source", "engine", "embodiment", "seed")},
             versions=json.loads(row["versions"]),
         ),
+        misplacement=Misplacement(**{f.name: row[MISPLACED + f.name] for f in fields(Misplacement)}),
         id=row["id"],
     )
 

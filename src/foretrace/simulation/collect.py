@@ -12,7 +12,7 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -33,12 +33,15 @@ from foretrace.interactions.record import Interaction, Outcome, Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation import lever_up, recipes
 from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.randomisation import NOTHING, Randomisation
 from foretrace.simulation.recipes import RECIPES
 
 SHARD_SIZE = 100
 """Interactions in one file."""
 CHUNK_SIZE = 10
 """Interactions that a worker hands over at once."""
+RANDOMISATION_STREAM = 2
+"""Tells the random numbers of what varies from those of objects, contact points and cameras."""
 PLAIN_REPORT_PERIOD = 10.0
 """Seconds between two lines of progress where there is no terminal."""
 
@@ -57,6 +60,8 @@ class CollectConfig:
     """How each lever-up is simulated."""
     recipe: str = "paper"
     """Which objects: one of RECIPES."""
+    randomisation: Randomisation = NOTHING
+    """What is drawn anew for every lever-up."""
 
     def __post_init__(self) -> None:
         for name in ("objects", "contacts_per_edge"):
@@ -73,6 +78,7 @@ SETTINGS_SINCE: dict[str, Any] = {
     "simulation.watch_time": 0.0,
     "simulation.physics.rolling_friction": Physics.rolling_friction,
     "simulation.physics.table_edge": None,
+    **{f"randomisation.{name}": value for name, value in asdict(NOTHING).items()},
 }
 """Settings that older data sets do not name, and what they were in effect."""
 
@@ -83,7 +89,7 @@ def num_trials(config: CollectConfig) -> int:
 
 
 def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, LeverUp, int]:
-    """Object, action and simulation seed of one trial.
+    """Object, action and simulation seed of one trial, before anything is varied.
 
     Raises:
         SimulationError: The configuration has no such trial.
@@ -99,7 +105,14 @@ def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, LeverUp, int]:
 def simulate_trial(config: CollectConfig, id: int) -> Interaction:
     """Simulate one trial, alone; the same interaction as in the data set of that configuration."""
     obj, action, seed = trial(config, id)
-    return lever_up.simulate_lever_up(obj, action, config.simulation, seed=seed, id=id)
+    if config.randomisation == NOTHING:
+        return lever_up.simulate_lever_up(obj, action, config.simulation, seed=seed, id=id)
+    rng = np.random.default_rng(
+        np.random.SeedSequence([config.seed, *_locate(config, id), RANDOMISATION_STREAM])
+    )
+    obj, physics, misplacement = config.randomisation.vary(obj, config.simulation.physics, rng)
+    simulation = replace(config.simulation, physics=physics)
+    return lever_up.simulate_lever_up(obj, action, simulation, seed=seed, id=id, misplacement=misplacement)
 
 
 def _locate(config: CollectConfig, id: int) -> tuple[int, int]:
@@ -166,7 +179,7 @@ def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[s
     """The manifest in the folder, checked against the configuration; a new one in an empty folder."""
     wanted = json.loads(json.dumps(asdict(config)))
     if not (out / storage.MANIFEST).exists():
-        manifest = storage.new_manifest(wanted, num_trials(config), SHARD_SIZE, _current_versions())
+        manifest = storage.new_manifest(wanted, num_trials(config), SHARD_SIZE, _current_versions(config))
         storage.write_manifest(out, manifest)
         return manifest
     manifest = storage.read_manifest(out)
@@ -178,8 +191,8 @@ def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[s
                 f"{out} was begun with {name} = {found.get(name)}, asked for is {name} = {asked.get(name)}; "
                 "use the same configuration to go on, or another folder"
             )
-    now, then = _current_versions(), manifest["versions"]
-    if changed := [f"{k} {now[k]} (was {then.get(k)})" for k in now if now[k] != then.get(k)]:
+    now, then = _current_versions(config), manifest["versions"]
+    if changed := [f"{k} {now[k]} (was {then.get(k, 'not noted')})" for k in now if now[k] != then.get(k)]:
         _say(console, f"warning: numbers may change within {out}, versions have: {', '.join(changed)}")
     return manifest
 
@@ -193,8 +206,12 @@ def _flat(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _current_versions() -> dict[str, str]:
-    libraries = {name: version(name) for name in ("foretrace", "mujoco", "numpy", "pyarrow")}
+def _current_versions(config: CollectConfig) -> dict[str, str]:
+    simulation = config.simulation
+    engine = lever_up.make_engine(
+        simulation.engine, simulation.embodiment, simulation.timestep, simulation.sample_period
+    )
+    libraries = {name: version(name) for name in ("foretrace", engine.library, "numpy", "pyarrow")}
     return {"python": platform.python_version(), "machine": platform.machine(), **libraries}
 
 

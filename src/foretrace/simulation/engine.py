@@ -12,6 +12,8 @@ from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation.tool import Tool
 
+ENGINES = ("mujoco", "bullet")
+"""Every engine by its name."""
 SPEED_LIMIT = 60.0
 """An object faster than this [m/s or rad/s] has been thrown by a numerical blow-up, not by a slow blade."""
 STANDING_DEPTH = 2e-4

@@ -15,8 +15,8 @@ from foretrace.errors import SimulationError
 from foretrace.geometry import Numbers, continuous_quaternions, quaternion_to_matrix
 from foretrace.objects import CollisionShape, CylinderShape, HullShape, MassProperties, ObjectModel
 from foretrace.objects.model import convex_mass_properties
+from foretrace.simulation.engine import ENGINES
 
-ENGINES = ("mujoco", "bullet")
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity on a level table [m/s^2]."""
 FLAT = "{} vertices enclose no volume: give at least four, not in one plane"

@@ -1,23 +1,39 @@
 """Play the action, judge and record the effect (paper, section 4)."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import SimulationError
-from foretrace.geometry import quaternion_to_matrix, tilt, transform_points
-from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
+from foretrace.geometry import (
+    continuous_quaternions,
+    invert_transform,
+    matrix_to_pose,
+    pose_to_matrix,
+    quaternion_to_matrix,
+    tilt,
+    transform_points,
+)
+from foretrace.interactions.record import (
+    AS_TOLD,
+    Effect,
+    Interaction,
+    Misplacement,
+    Outcome,
+    Physics,
+    Provenance,
+)
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
-from foretrace.simulation.engine import Engine, Motion
+from foretrace.simulation.engine import ENGINES, Engine, Motion
 from foretrace.simulation.tool import Tool
 
 CAMERAS = ("exact", "rgbd")
-ENGINES = ("mujoco", "bullet")
 LIFTED_TILT = np.deg2rad(3.0)
 """An object tilted by more than this counts as lifted [rad]."""
 OFF_SAMPLES = 2
@@ -105,6 +121,7 @@ def simulate_lever_up(
     *,
     seed: int = 0,
     id: int = 0,
+    misplacement: Misplacement = AS_TOLD,
 ) -> Interaction:
     """Simulates one lever-up and records it.
 
@@ -114,6 +131,8 @@ def simulate_lever_up(
         config: How.
         seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
         id: Number of the interaction within its data set.
+        misplacement: How far from what it is told the blade acts. View and effect stay in the told frame; joint
+            angles are those that were played.
 
     Returns:
         The interaction; its outcome is ``failed`` and its trajectories are empty if the simulation diverged.
@@ -133,12 +152,16 @@ def simulate_lever_up(
 
         view = take_rgbd(obj, action, seed=seed).view()
     path = replace(config.path, hold_time=config.path.hold_time + config.watch_time)
-    motion = engine.play(obj, action, path, config.tool, config.physics)
+    done = action if misplacement == AS_TOLD else action.moved(**asdict(misplacement))
+    motion = engine.play(obj, done, path, config.tool, config.physics)
+    effect = judge(motion, obj, done, config.physics)
+    if done is not action:
+        effect = _transformed(effect, action.T_action_object @ invert_transform(done.T_action_object))
     return Interaction(
         object=obj,
         action=action,
         view=view,
-        effect=judge(motion, obj, action, config.physics),
+        effect=effect,
         physics=config.physics,
         provenance=Provenance(
             source="simulated",
@@ -147,6 +170,7 @@ def simulate_lever_up(
             seed=seed,
             versions=_versions(engine.library),
         ),
+        misplacement=misplacement,
         id=id,
     )
 
@@ -238,6 +262,20 @@ def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -
         fall_index=fall,
         path_error=motion.path_error,
     )
+
+
+def _transformed(effect: Effect, T_told_done: Float[np.ndarray, "4 4"]) -> Effect:
+    """An effect in the frame that was told, from the frame in which the blade really acted."""
+    told: dict[str, Any] = {
+        "com_trajectory": transform_points(T_told_done, effect.com_trajectory),
+        "support_points": transform_points(
+            T_told_done, np.column_stack([effect.support_points, np.zeros(2)])
+        )[:, :2],
+    }
+    for name in ("pose_trajectory", "tool_trajectory"):
+        pose = matrix_to_pose(T_told_done @ pose_to_matrix(getattr(effect, name)))
+        told[name] = np.concatenate([pose[:, :3], continuous_quaternions(pose[:, 3:])], axis=1)
+    return replace(effect, **told)
 
 
 def _until_the_floor(motion: Motion, obj: ObjectModel, physics: Physics) -> tuple[Motion, int | None]:

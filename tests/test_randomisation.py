@@ -1,0 +1,258 @@
+import json
+from collections import Counter
+from dataclasses import asdict, fields, replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import factories
+from engines_at_hand import WITHOUT_BULLET
+from foretrace.actions import LeverUp
+from foretrace.cli import main
+from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError
+from foretrace.evaluation.description import describe_dataset
+from foretrace.geometry import transform_points
+from foretrace.interactions import storage
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.doctor import examine
+from foretrace.interactions.record import AS_TOLD, Interaction, Misplacement, Physics
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import NO_BEVEL, Box, Cylinder, Prism
+from foretrace.simulation.collect import CollectConfig, collect, simulate_trial, trial
+from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.randomisation import FACTORS, LARGEST, NOTHING, RANDOMISED, RANGES, Randomisation
+
+TOOL = SimulationConfig(embodiment="tool")
+PLAIN = CollectConfig(objects=8, simulation=TOOL)
+VARIED = replace(PLAIN, randomisation=RANDOMISED)
+PENTAGON = Prism([[0.1, 0.0], [0.02, 0.09], [-0.08, 0.05], [-0.07, -0.06], [0.04, -0.09]])
+
+
+def fake_trial(config: CollectConfig, id: int) -> Interaction:
+    """What `simulate_trial` draws, without its physics."""
+    made = []
+
+    def fake(obj, action, config, *, seed, id, misplacement=AS_TOLD):
+        made.append(replace(factories.fake_lever_up(obj, action, id=id, seed=seed), physics=config.physics))
+        return replace(made[0], misplacement=misplacement)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake)
+        return simulate_trial(config, id)
+
+
+def drawn(randomisation: Randomisation, seed: int) -> dict[str, float]:
+    """What one lever-up of a prism gets."""
+    obj, physics, misplacement = randomisation.vary(PENTAGON, Physics(), np.random.default_rng(seed))
+    assert isinstance(obj, Prism)
+    return {
+        "friction": physics.friction,
+        "tool_friction": physics.tool_friction,
+        "density": physics.density,
+        "thickness_factor": obj.height / PENTAGON.height,
+        "bevel_width_factor": obj.bevel.width / PENTAGON.bevel.width,
+        "bevel_height_factor": obj.bevel.height / PENTAGON.bevel.height,
+        **{f"misplaced_{name}": value for name, value in asdict(misplacement).items()},
+    }
+
+
+@pytest.fixture(scope="module")
+def varied(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("varied") / "data"
+    collect(VARIED, folder, workers=1, console=Console(quiet=True), simulate=fake_trial)
+    return folder
+
+
+# --- what is drawn --------------------------------------------------------------------------------------------
+
+
+def test_draws_fill_their_ranges_and_stay_within():
+    every = [drawn(RANDOMISED, seed) for seed in range(300)]
+    limits = {name: getattr(RANDOMISED, name) for name in RANGES}
+    limits |= {name: (-getattr(RANDOMISED, name), getattr(RANDOMISED, name)) for name in LARGEST}
+    assert limits.keys() == {field.name for field in fields(Randomisation)}
+    values = {name: np.array([each[name] for each in every]) for name in limits}
+    for name, (low, high) in limits.items():
+        margin = 0.05 * (high - low)
+        assert low - 1e-12 <= values[name].min() < low + margin, name
+        assert high - margin < values[name].max() <= high + 1e-12, name
+    correlations = np.corrcoef(np.stack(list(values.values()))) - np.eye(len(values))
+    assert np.abs(correlations).max() < 0.25
+
+
+@pytest.mark.parametrize("name", [*RANGES, *LARGEST])
+def test_what_is_drawn_for_one_quantity_does_not_depend_on_the_others(name):
+    alone = Randomisation(**{name: getattr(RANDOMISED, name)})
+    expected = drawn(NOTHING, 5) | {name: drawn(RANDOMISED, 5)[name]}
+    assert drawn(alone, 5) == pytest.approx(expected)
+    assert drawn(alone, 5)[name] != drawn(NOTHING, 5)[name]
+
+
+def test_objects_without_thickness_or_bevel_stay_as_they_are():
+    shape = Randomisation(**{name: (0.5, 0.9) for name in FACTORS})
+    rng = np.random.default_rng(0)
+    cylinder = Cylinder(0.02, 0.1)
+    assert shape.vary(cylinder, Physics(), rng)[0] is cylinder
+    assert NOTHING.vary(PENTAGON, Physics(), rng)[0] is PENTAGON
+    box, _, _ = shape.vary(Box(0.1, 0.06, 0.04), Physics(), rng)
+    assert isinstance(box, Box)
+    assert (box.width, box.depth) == (0.1, 0.06)
+    assert 0.02 <= box.height <= 0.036
+    sharp, _, _ = shape.vary(Prism(PENTAGON.corners, 0.02, NO_BEVEL), Physics(), rng)
+    assert isinstance(sharp, Prism)
+    assert sharp.bevel == NO_BEVEL
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("friction", (1.0, 0.5)),
+        ("tool_friction", (0.0, 0.5)),
+        ("density", (float("nan"), 900.0)),
+        ("thickness_factor", (0.5, float("inf"))),
+        ("misplaced_ahead", 0.02),
+        ("misplaced_left", -0.001),
+        ("misplaced_turn", float("nan")),
+    ],
+)
+def test_impossible_randomisations_are_refused(setting, value):
+    with pytest.raises(SimulationError, match=f"randomisation: {setting} = "):
+        Randomisation(**{setting: value})
+
+
+def test_a_shape_that_cannot_be_is_refused_and_its_trial_named(tmp_path):
+    flat = replace(PLAIN, randomisation=Randomisation(thickness_factor=(0.1, 0.1)))
+    with pytest.raises(ShapeError, match="bevel of height"):
+        simulate_trial(flat, 0)
+    with pytest.raises(SimulationError, match="trial 0 cannot be simulated: bevel of height"):
+        collect(flat, tmp_path, workers=1, console=Console(quiet=True))
+
+
+# --- trials and data sets -------------------------------------------------------------------------------------
+
+
+def test_objects_and_actions_are_those_of_the_plain_data_set():
+    for id in (0, 17, 60):
+        plain, varied = fake_trial(PLAIN, id), fake_trial(VARIED, id)
+        np.testing.assert_array_equal(plain.object.corners, varied.object.corners)
+        np.testing.assert_array_equal(plain.action.contact, varied.action.contact)
+        assert plain.provenance.seed == varied.provenance.seed
+        assert plain.misplacement == AS_TOLD
+        assert plain.physics == Physics()
+        assert varied.physics != fake_trial(VARIED, id + 1).physics
+        assert varied.physics == fake_trial(replace(VARIED, objects=16), id).physics
+        assert varied.physics != fake_trial(replace(VARIED, seed=1), id).physics
+
+
+def test_a_plain_trial_is_simulated_as_if_there_were_no_randomisation():
+    obj, action, seed = trial(PLAIN, 11)
+    alone = simulate_lever_up(obj, action, TOOL, seed=seed, id=11)
+    found = simulate_trial(PLAIN, 11)
+    for field in fields(found.effect):
+        expected, value = getattr(alone.effect, field.name), getattr(found.effect, field.name)
+        np.testing.assert_array_equal(value, expected, err_msg=field.name)
+
+
+def test_what_was_drawn_is_recorded(varied):
+    dataset = Dataset.open(varied)
+    again = fake_trial(VARIED, 42)
+    stored = dataset.with_id(42)
+    assert stored.physics == again.physics
+    assert stored.misplacement == again.misplacement != AS_TOLD
+    assert stored.object.to_dict() == again.object.to_dict()
+    assert storage.read_manifest(varied)["configuration"]["randomisation"]["friction"] == [0.5, 1.1]
+    numbers = dataset.table["object_id"].to_pylist()
+    assert Counter(numbers) == {k: 2 * (3 + k) for k in range(8)}
+    assert np.ptp(dataset.batch().friction) > 0.5
+
+
+def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
+    figures = describe_dataset(Dataset.open(varied))
+    expected = {*storage.PHYSICS_COLUMNS[:3], "height", "bevel_width", "bevel_height", *LARGEST}
+    assert figures["varies"].keys() == expected
+    low, high = figures["varies"]["height"]
+    assert 0.015 <= low < 0.016 < 0.024 < high <= 0.025
+    assert main(["describe", str(varied)]) == 0
+    assert "tool friction" in capsys.readouterr().out
+    assert examine(varied).findings == ()
+    collect(PLAIN, tmp_path / "plain", workers=1, console=Console(quiet=True), simulate=fake_trial)
+    assert describe_dataset(Dataset.open(tmp_path / "plain")[:20])["varies"] == {}
+    manifest = storage.read_manifest(varied)
+    for name in manifest["shards"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes((varied / name).read_bytes())
+    manifest["configuration"]["randomisation"] |= {"friction": [0.5, 0.51], "misplaced_left": 1e-4}
+    storage.write_manifest(tmp_path, manifest)
+    problems = [finding.problem for finding in examine(tmp_path).findings]
+    assert any("friction = " in p and "was not drawn from 0.5 to 0.51" in p for p in problems)
+    assert any("misplaced_left = " in p and "from -0.0001 to 0.0001" in p for p in problems)
+
+
+def test_a_plain_folder_is_not_gone_on_with_randomised(tmp_path):
+    collect(PLAIN, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
+    with pytest.raises(
+        DatasetError, match=r"begun with randomisation\.bevel_height_factor = None, asked for"
+    ):
+        collect(VARIED, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
+    manifest = storage.read_manifest(tmp_path)
+    del manifest["configuration"]["randomisation"]  # as older data sets have it
+    first = storage.shard_name(0)
+    older = storage.read_shard(tmp_path, first)[0].drop_columns(list(LARGEST))
+    manifest["shards"][first] = storage.write_shard(tmp_path, first, older)
+    storage.write_manifest(tmp_path, manifest)
+    collect(PLAIN, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
+    assert examine(tmp_path).findings == ()
+    assert Dataset.open(tmp_path)[0].misplacement == AS_TOLD
+
+
+def test_simulate_randomise_from_the_command_line(tmp_path):
+    out = tmp_path / "data"
+    options = ["--objects", "1", "--contacts-per-edge", "1", "--embodiment", "tool", "--workers", "1"]
+    assert main(["simulate", "--out", str(out), *options, "--randomise"]) == 0
+    dataset = Dataset.open(out)
+    assert len(set(dataset.table["friction"].to_pylist())) == len(dataset) == 3
+    configuration = json.loads(json.dumps(asdict(RANDOMISED)))
+    assert dataset.manifest["configuration"]["randomisation"] == configuration
+
+
+@WITHOUT_BULLET
+def test_the_manifest_names_the_engines_own_library(tmp_path):
+    bullet = replace(PLAIN, simulation=SimulationConfig(engine="bullet", embodiment="tool"))
+    for config, library, other in ((bullet, "pybullet", "mujoco"), (PLAIN, "mujoco", "pybullet")):
+        folder = tmp_path / library
+        collect(config, folder, workers=1, console=Console(quiet=True), simulate=fake_trial)
+        versions = storage.read_manifest(folder)["versions"]
+        assert library in versions
+        assert other not in versions
+
+
+# --- misplaced blades -----------------------------------------------------------------------------------------
+
+
+def test_a_misplaced_blade_is_told_in_the_frame_that_was_asked_for():
+    action = LeverUp.at_edge(PENTAGON, 1)
+    error = Misplacement(0.002, -0.003, 0.05)
+    told = simulate_lever_up(PENTAGON, action, TOOL, misplacement=error)
+    done = simulate_lever_up(PENTAGON, action.moved(0.002, -0.003, 0.05), TOOL)
+    np.testing.assert_array_equal(told.view.mask, TopDownView.of(PENTAGON, action).mask)
+    com = transform_points(action.T_action_object, PENTAGON.mass_properties(1.0).com[None])[0]
+    np.testing.assert_allclose(told.effect.com_trajectory[0], com, atol=1e-4)
+    # The same motion of the same object, seen from another frame.
+    T_told_done = action.T_action_object @ np.linalg.inv(done.action.T_action_object)
+    for name in ("pose_trajectory", "tool_trajectory", "com_trajectory"):
+        there = transform_points(T_told_done, getattr(done.effect, name)[:, :3])
+        np.testing.assert_allclose(getattr(told.effect, name)[:, :3], there, atol=1e-12)
+    np.testing.assert_allclose(told.effect.tool_trajectory[0, :2], [-0.006, -0.003], atol=1e-3)
+    corners = transform_points(
+        action.T_action_object, np.column_stack([PENTAGON.support_corners, np.zeros(5)])
+    )
+    pair = corners[list(told.effect.support_corners), :2]
+    np.testing.assert_allclose(told.effect.support_points, pair, atol=1e-12)
+    assert told.effect.outcome == done.effect.outcome
+    assert told.misplacement == error
+
+
+def test_what_is_told_must_lie_on_the_outline_however_the_blade_errs():
+    with pytest.raises(ActionError, match="from the object's outline"):
+        simulate_lever_up(PENTAGON, LeverUp((0.0, 0.0), (1.0, 0.0)), TOOL, misplacement=Misplacement(0.001))
