@@ -11,8 +11,10 @@ $(STAMP): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,docs,video]'
-	$(BIN)/pip install --quiet --constraint constraints.txt --only-binary :all: pybullet \
-		|| echo "no pybullet for this Python: without Bullet, its tests are skipped"
+	for package in pybullet rerun-sdk rosbags; do \
+		$(BIN)/pip install --quiet --constraint constraints.txt --only-binary :all: $$package \
+			|| echo "no $$package for this Python: its tests are skipped"; \
+	done
 	touch $(STAMP)
 
 demo: setup

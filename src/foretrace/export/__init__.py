@@ -1,0 +1,1 @@
+"""The way out: interactions, and what was imagined about them, in the formats of other tools."""
