@@ -16,6 +16,7 @@ from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
 from foretrace.objects import Prism
+from foretrace.objects.surface import faces_of
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +126,7 @@ def test_contact_sheet_shows_every_outcome():
 
 def test_faces_close_around_a_prism(interaction):
     obj = interaction.object
-    faces = animation.faces_of(obj)
+    faces = faces_of(obj)
     assert len(faces) == 2 + 2 * len(obj.corners)
     # The divergence theorem: outward faces of a closed surface sum up to its volume.
     volume = 0.0

@@ -1,7 +1,6 @@
 """Moving pictures of interactions: the solid object, the blade, and the paths as they unroll."""
 
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,8 @@ from foretrace.evaluation import figures
 from foretrace.evaluation.figures import CM, STYLE, TOOL_REACH, Scene
 from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
-from foretrace.objects import Cylinder, MeshObject, ObjectModel
+from foretrace.objects import MeshObject
+from foretrace.objects.surface import faces_of
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)
 """Where the camera stands: turned from the action's direction towards its right, and raised."""
@@ -99,26 +99,6 @@ def project(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return points @ np.stack([right, np.cross(towards, right), towards]).T
 
 
-def faces_of(obj: ObjectModel) -> list[Float[np.ndarray, "_ 3"]]:
-    """The object's surface as polygons, counter-clockwise from outside, in the object frame [m]."""
-    if isinstance(obj, MeshObject):
-        return list(obj.vertices[obj.faces])
-    if isinstance(obj, Cylinder):
-        near, far = (end[::DRAWN_FACETS] for end in np.split(obj.convex_pieces()[0], 2))
-        strips = zip(near, np.roll(near, -1, axis=0), np.roll(far, -1, axis=0), far, strict=True)
-        return [near[::-1], far, *(np.stack(corners) for corners in strips)]
-    rim = min((piece[piece[:, 2] > 0, 2].min() for piece in obj.convex_pieces()), default=0.0)
-    bottom, top = obj.support_corners, obj.corners
-    layers = [
-        np.column_stack([xy, np.full(len(xy), z)]) for xy, z in ((bottom, 0.0), (top, rim), (top, obj.height))
-    ]
-    faces = [layers[0][::-1], layers[2]]
-    for lower, upper in pairwise(layers):
-        following = np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0)
-        faces += [np.stack(corners) for corners in zip(lower, following[0], following[1], upper, strict=True)]
-    return faces
-
-
 def _tool_faces() -> list[np.ndarray]:
     """Blade and shaft as flat strips in the tip's frame, which points along the blade."""
     half, shaft = BLADE_WIDTH / 2, 0.004
@@ -147,7 +127,7 @@ def _draw_stage(ax: Axes, scene: Scene, k: int) -> None:
     """The table, the object's shadow, object and blade, and the paths up to sample ``k``."""
     _draw_table(ax, scene)
     pose = pose_to_matrix(scene.pose[k])
-    body = [transform_points(pose, face) for face in faces_of(scene.obj)]
+    body = [transform_points(pose, face) for face in faces_of(scene.obj, DRAWN_FACETS)]
     shadow = convex_hull(np.concatenate(body)[:, :2])
     ground = project(np.column_stack([shadow, np.zeros(len(shadow))]))[:, :2] * CM
     ax.fill(*ground.T, color="#cfd3da", linewidth=0, zorder=1)
@@ -189,7 +169,7 @@ def _table_corners(scene: Scene) -> np.ndarray:
 
 def _limits(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
     """Range of the projected scene over its whole time [cm]."""
-    faces = np.concatenate(faces_of(scene.obj))
+    faces = np.concatenate(faces_of(scene.obj, DRAWN_FACETS))
     few = scene.pose[:: max(1, len(scene.pose) // 12)]
     seen = [_table_corners(scene), *(transform_points(pose_to_matrix(pose), faces) for pose in few)]
     seen += [path for _, path, *_ in scene.paths()]
