@@ -42,3 +42,15 @@ class PredictionError(ForetraceError):
 
 class ResultsError(ForetraceError):
     """Results that are missing, damaged or of another version, data set or recipe; an experiment that is unknown."""
+
+
+class PerceptionError(ForetraceError):
+    """A picture, a camera or a recording that tells too little: no marker, wrong size, dark, cut off, out of order."""
+
+
+class RobotError(ForetraceError):
+    """A real arm that cannot be reached, a path that it must not follow, or a motion that was stopped."""
+
+
+class ExportError(ForetraceError):
+    """An export that cannot be written: nothing chosen, the target exists, a library is missing, uneven sampling."""

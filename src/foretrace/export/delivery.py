@@ -1,0 +1,62 @@
+"""How an export reaches its folder: whole or not at all."""
+
+import importlib
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from foretrace.errors import ExportError
+
+T = TypeVar("T")
+
+
+def require(module: str, extra: str) -> None:
+    """Make sure that an optional library is there.
+
+    Raises:
+        ExportError: It is not installed.
+    """
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ExportError(
+            f"cannot export: {module} is not installed; install it with `pip install 'foretrace[{extra}]'`"
+        ) from error
+
+
+@contextmanager
+def delivered(out: Path) -> Iterator[Path]:
+    """An empty folder to write to, which takes its final name when everything in it is done.
+
+    Args:
+        out: The final name.
+
+    Raises:
+        ExportError: Something has that name already.
+    """
+    if out.exists() or out.is_symlink():
+        raise ExportError(f"{out} exists already and is not overwritten: choose another --out, or remove it")
+    draft = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    try:
+        draft.mkdir(parents=True)
+    except OSError as error:
+        raise ExportError(f"cannot write to {out.parent} ({error.strerror}): choose another --out") from error
+    try:
+        yield draft
+        os.replace(draft, out)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def watched(items: Sequence[T], what: str) -> Iterator[T]:
+    """The items one by one, with a bar on the terminal that shows how many are done."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        yield from bar.track(items, total=len(items), description=what)

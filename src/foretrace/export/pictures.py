@@ -1,0 +1,102 @@
+"""Pictures of an interaction over time: rendered again from its recorded poses, as a camera beside the table sees them."""
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foretrace.errors import ExportError, SimulationError
+from foretrace.geometry import matrix_to_pose, pose_to_matrix
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.record import Interaction
+from foretrace.simulation.camera import make_renderer
+from foretrace.simulation.scene import body_origin, build_scene
+from foretrace.simulation.tool import Tool, add_blade
+
+CAMERA = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+"""The camera's intrinsics."""
+CAMERA_POSITION = np.array([0.12, -0.5, 0.36])
+"""Where it stands in the action frame [m]: to the right of the action, looking down on it."""
+CAMERA_AIM = np.array([0.07, 0.0, 0.02])
+"""The point in the action frame that it looks at [m]."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What a colour and depth camera sees, picture by picture."""
+
+    rgb: UInt8[np.ndarray, "time rows columns 3"]
+    """Colour."""
+    depth: Float[np.ndarray, "time rows columns"]
+    """Distance along the optical axis [m], as float32."""
+    camera: PinholeCamera
+    """Intrinsics."""
+    T_action_camera: Float[np.ndarray, "4 4"]
+    """Pose of the camera in the action frame (camera frame: x right, y down, z forward)."""
+
+
+def camera_pose() -> Float[np.ndarray, "4 4"]:
+    """T_action_camera of the camera beside the table."""
+    forward = CAMERA_AIM - CAMERA_POSITION
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = CAMERA_POSITION
+    return pose
+
+
+def take_pictures(
+    interaction: Interaction,
+    object_poses: Float[np.ndarray, "time 7"],
+    tool_poses: Float[np.ndarray, "time 7"],
+) -> Pictures:
+    """Renders a simulated interaction: object, screwdriver and table, without the arm.
+
+    Args:
+        interaction: Whose object, on whose table.
+        object_poses: Object frame in the action frame: position [m], quaternion (w, x, y, z).
+        tool_poses: Blade tip in the action frame, likewise.
+
+    Raises:
+        ExportError: The machine cannot render.
+    """
+    obj, pose = interaction.object, camera_pose()
+    spec = build_scene(obj, interaction.physics, Tool(), None, timestep=0.002)
+    body = spec.worldbody.add_body(name="tool")
+    body.add_freejoint()
+    add_blade(body, Tool(), 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
+    # MuJoCo's camera has y up and looks along -z.
+    T_action_lens = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+    lens = matrix_to_pose(T_action_lens)
+    spec.worldbody.add_camera(name="beside", pos=lens[:3], quat=lens[3:])
+    model = spec.compile()
+    model.cam_fovy[0] = np.rad2deg(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
+    data = mujoco.MjData(model)
+    T_object_body = np.eye(4)
+    T_object_body[:3, 3] = body_origin(obj)
+    bodies = matrix_to_pose(pose_to_matrix(object_poses) @ T_object_body)
+    shape = (len(bodies), CAMERA.height, CAMERA.width)
+    rgb, depth = np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
+    try:
+        renderer = make_renderer(model, CAMERA.height, CAMERA.width)
+    except SimulationError as error:
+        raise ExportError(f"{error}; or export without pictures: --no-camera") from error
+    with renderer:
+        for k in range(len(bodies)):
+            data.qpos[:] = np.concatenate([bodies[k], tool_poses[k]])
+            mujoco.mj_forward(model, data)
+            for wanted in (rgb, depth):
+                if wanted is depth:
+                    renderer.enable_depth_rendering()
+                renderer.update_scene(data, camera="beside")
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+                wanted[k] = renderer.render()
+                renderer.disable_depth_rendering()
+    return Pictures(rgb, depth, CAMERA, pose)
