@@ -14,6 +14,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 import foretrace
+from foretrace.cli.calibrate import calibrate
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
@@ -57,6 +58,7 @@ COMMANDS: dict[str, Command | Group] = {
     "show": show,
     "describe": describe,
     "doctor": doctor,
+    "calibrate": calibrate,
 }
 """Every command by its name."""
 

@@ -1,0 +1,54 @@
+"""The command that calibrates a camera."""
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from foretrace.cli.console import say
+
+
+def calibrate(
+    pictures: Positional[tuple[Path, ...]] = (),
+    squares: tuple[int, int] = (7, 5),
+    square_length: float = 0.035,
+    marker_length: float = 0.026,
+    dictionary: str = "5x5_100",
+    out: Path = Path("camera.json"),
+    print_board: Path | None = None,
+) -> None:
+    """Calibrate a camera from pictures of a ChArUco board, or write the board for printing.
+
+    Args:
+        pictures: Pictures or folders of pictures: 10 to 20 of the board, slanted, near and far, also in the corners.
+        squares: Squares of the board along x and y.
+        square_length: Side of a square, measured on the print [m].
+        marker_length: Side of a marker [m].
+        dictionary: Dictionary of its markers.
+        out: File for the camera.
+        print_board: Write the board to this .png or .pdf file instead.
+    """
+    from foretrace.errors import PerceptionError
+    from foretrace.perception.calibration import Board, read_pictures
+    from foretrace.perception.calibration import calibrate as calibrate_camera
+
+    board = Board(squares, square_length, marker_length, dictionary)
+    if print_board is not None:
+        board.save(print_board)
+        width, height = (1000 * length for length in board.size)
+        print(f"{print_board}: print at 100 %, the board then measures {width:.1f} x {height:.1f} mm")
+        return
+    if not pictures:
+        raise PerceptionError("no pictures are given: name pictures of the board, or --print-board FILE")
+    found = calibrate_camera(read_pictures(pictures), board)
+    for name, error in found.errors.items():
+        print(f"{name}: {error:.3f} pixels")
+    for name, reason in found.left_out.items():
+        say(f"left out: {name} {reason}")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    found.camera.save(out, error_pixels=found.error, pictures=len(found.errors))
+    camera = found.camera
+    print(
+        f"focal lengths {camera.fx:.1f} and {camera.fy:.1f}, centre {camera.cx:.1f}, {camera.cy:.1f} pixels"
+    )
+    print(f"error {found.error:.3f} pixels over {len(found.errors)} pictures")
+    print(out)

@@ -1,0 +1,277 @@
+"""Calibrate a camera from pictures of a ChArUco board: a chessboard with a marker in every white square."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foretrace.errors import PerceptionError
+from foretrace.geometry import invert_transform
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.markers import (
+    dictionary,
+    fitting_dictionaries,
+    grey,
+    picture_fault,
+    to_transform,
+)
+
+FEWEST_PICTURES = 5
+"""So many pictures that show the board are needed."""
+FEWEST_CORNERS = 8
+"""A picture counts that shows at least so many inner corners of the board."""
+LARGEST_ERROR = 1.0
+"""A calibration that misses the corners by more than this is refused [pixel]."""
+LEAST_TILT = np.deg2rad(10.0)
+"""Some pictures must see the board slanted by at least this, or the focal length stays unknown [rad]."""
+PAPER = 0.02
+"""White margin round a printed board [m]."""
+INCH = 0.0254
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+"""Pictures that are read."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A ChArUco board, as printed; its frame has its origin in a corner, z out of it.
+
+    Raises:
+        PerceptionError: The lengths or the number of squares make no board.
+    """
+
+    squares: tuple[int, int] = (7, 5)
+    """Squares along x and y."""
+    square_length: float = 0.035
+    """Side of a square [m]."""
+    marker_length: float = 0.026
+    """Side of a marker [m]."""
+    dictionary: str = "5x5_100"
+    """Dictionary of its markers."""
+
+    def __post_init__(self) -> None:
+        columns, rows = self.squares
+        if min(columns, rows) < 3:
+            raise PerceptionError(f"board of {columns} x {rows} squares: at least 3 x 3 are needed")
+        if not 0 < self.marker_length < self.square_length < 1:
+            raise PerceptionError(
+                f"board with markers of {self.marker_length} m in squares of {self.square_length} m: "
+                "the marker must be smaller than its square, both in metres"
+            )
+        size = dictionary(self.dictionary).bytesList.shape[0]
+        if columns * rows // 2 > size:
+            raise PerceptionError(
+                f"board of {columns} x {rows} squares needs {columns * rows // 2} markers, {self.dictionary} has {size}"
+            )
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        return self.squares[0] * self.square_length, self.squares[1] * self.square_length
+
+    def draw(self, pixels_per_metre: float = 300 / INCH) -> UInt8[np.ndarray, "rows columns"]:
+        """The board as a picture, without a margin; at 300 dots per inch by default."""
+        width, height = (round(length * pixels_per_metre) for length in self.size)
+        return self._board.generateImage((width, height), marginSize=0)
+
+    def save(self, path: str | Path) -> None:
+        """Write the board for printing at its true size, as PNG (300 dots per inch) or PDF.
+
+        Raises:
+            PerceptionError: The name ends in neither.
+        """
+        from PIL import Image
+
+        path = Path(path)
+        if path.suffix.lower() not in (".png", ".pdf"):
+            raise PerceptionError(f"cannot write a board to {path}: choose a name that ends in .png or .pdf")
+        margin = round(PAPER * 300 / INCH)
+        picture = np.pad(self.draw(), margin, constant_values=255)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(picture).save(path, dpi=(300, 300), resolution=300)
+
+    def find(
+        self, picture: UInt8[np.ndarray, "rows columns *channels"]
+    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]:
+        """Inner corners of the board [m] and where they were seen [pixel]; no rows where it was not."""
+        corners, ids, _, _ = self._detector.detectBoard(grey(picture))
+        if ids is None or len(ids) == 0:
+            return np.zeros((0, 3)), np.zeros((0, 2))
+        known = np.asarray(self._board.getChessboardCorners(), dtype=float).reshape(-1, 3)
+        # OpenCV's board has y downwards and z into it; ours has y upwards and z out of it.
+        known = known * [1.0, -1.0, 0.0] + [0.0, self.size[1], 0.0]
+        return known[np.ravel(ids).astype(int)], np.asarray(corners, dtype=float).reshape(-1, 2)
+
+    def pose(
+        self,
+        picture: UInt8[np.ndarray, "rows columns *channels"],
+        camera: PinholeCamera,
+        name: str = "picture",
+    ) -> Float[np.ndarray, "4 4"]:
+        """T_board_camera: the camera's pose over a board that lies on the table, whose frame is the table frame.
+
+        Raises:
+            PerceptionError: The picture is of another camera or does not show the board.
+        """
+        camera.check_picture(picture, name)
+        points, pixels = self.find(picture)
+        if len(points) < FEWEST_CORNERS or not _spans_plane(points):
+            raise PerceptionError(f"{name} {self._what_is_missing(picture, len(points))}")
+        found, rvec, tvec = cv2.solvePnP(
+            points, pixels, camera.matrix, camera.coefficients, flags=cv2.SOLVEPNP_IPPE
+        )
+        if not found:
+            raise PerceptionError(f"{name}: no pose explains the board's corners: show more of it")
+        rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, camera.coefficients, rvec, tvec)
+        return invert_transform(to_transform(rvec, tvec))
+
+    def _what_is_missing(self, picture: UInt8[np.ndarray, "rows columns *channels"], found: int) -> str:
+        """Why a picture does not do, in words."""
+        if fault := picture_fault(picture):
+            return f"shows {found} corners of the board: {fault}"
+        fitting = fitting_dictionaries(picture)
+        if fitting and self.dictionary.lower() not in fitting:
+            return (
+                f"shows {found} corners of the board: its markers are of {fitting[0]}, not {self.dictionary}"
+            )
+        return (
+            f"shows {found} corners of the board, {FEWEST_CORNERS} over two rows are needed: show more of it, and "
+            "check squares and dictionary"
+        )
+
+    @cached_property
+    def _board(self) -> cv2.aruco.CharucoBoard:
+        markers = dictionary(self.dictionary)
+        return cv2.aruco.CharucoBoard(self.squares, self.square_length, self.marker_length, markers)
+
+    @cached_property
+    def _detector(self) -> cv2.aruco.CharucoDetector:
+        return cv2.aruco.CharucoDetector(self._board)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated camera, and how well it explains the pictures."""
+
+    camera: PinholeCamera
+    """The camera."""
+    error: float
+    """Root mean square of the reprojection error over all corners [pixel]."""
+    errors: dict[str, float]
+    """The same for each picture that was used."""
+    left_out: dict[str, str]
+    """Pictures that were not used, and why."""
+
+
+def calibrate(
+    pictures: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board
+) -> Calibration:
+    """Focal lengths, centre and distortion (k1, k2, p1, p2, k3) from pictures of a board (Zhang, 2000).
+
+    Args:
+        pictures: Pictures by name, all of one size: the board from several sides, slanted, also in the corners.
+        board: What they show.
+
+    Raises:
+        PerceptionError: Too few pictures show the board, their sizes differ, none sees it slanted, or no camera
+            explains them.
+    """
+    sizes = {name: (picture.shape[1], picture.shape[0]) for name, picture in pictures.items()}
+    if len(set(sizes.values())) > 1:
+        first, second = list(dict.fromkeys(sizes.values()))[:2]
+        odd = next(name for name, size in sizes.items() if size == second)
+        raise PerceptionError(
+            f"pictures of different sizes: {odd} has {second[0]} x {second[1]} pixels, others {first[0]} x {first[1]}: "
+            "calibrate with pictures of one camera at one resolution"
+        )
+    points, pixels, used, left_out = [], [], [], {}
+    for name, picture in pictures.items():
+        known, seen = board.find(picture)
+        if len(known) < FEWEST_CORNERS or not _spans_plane(known):
+            fault = picture_fault(picture)
+            left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
+            continue
+        points.append(known.astype(np.float32))
+        pixels.append(seen.astype(np.float32))
+        used.append(name)
+    if len(used) < FEWEST_PICTURES:
+        odd = next(iter(left_out), "")
+        reason = (
+            f"; {odd} {board._what_is_missing(pictures[odd], len(board.find(pictures[odd])[0]))}"
+            if odd
+            else ""
+        )
+        raise PerceptionError(
+            f"{len(used)} of {len(pictures)} pictures show the board, {FEWEST_PICTURES} are needed{reason}"
+        )
+    size = next(iter(sizes.values()))
+    error, matrix, distortion, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
+        points, pixels, size, np.eye(3), np.zeros(5)
+    )
+    tilts = [
+        np.arccos(np.clip(abs(to_transform(r, t)[2, 2]), 0, 1)) for r, t in zip(rvecs, tvecs, strict=True)
+    ]
+    if max(tilts) < LEAST_TILT:
+        raise PerceptionError(
+            f"no picture sees the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
+            "the focal length cannot be told from that; tilt the board or the camera by 20 to 45 degrees"
+        )
+    if not error <= LARGEST_ERROR:
+        raise PerceptionError(
+            f"no camera explains the pictures: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
+            "accepted; check squares and flatness of the board, and that zoom and focus are fixed"
+        )
+    camera = PinholeCamera(
+        *size,
+        matrix[0, 0],
+        matrix[1, 1],
+        matrix[0, 2],
+        matrix[1, 2],
+        tuple(np.ravel(distortion)[:5].tolist()),
+    )
+    errors = {
+        name: float(np.sqrt((np.linalg.norm(camera.project(p, to_transform(r, t)) - q, axis=1) ** 2).mean()))
+        for name, p, q, r, t in zip(used, points, pixels, rvecs, tvecs, strict=True)
+    }
+    return Calibration(camera, float(error), errors, left_out)
+
+
+def read_pictures(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "rows columns 3"]]:
+    """Pictures by name, blue-green-red; folders stand for the pictures in them.
+
+    Raises:
+        PerceptionError: One is missing or cannot be read, or there is none.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        inside = (
+            sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+            if path.is_dir()
+            else [path]
+        )
+        files += inside
+    if not files:
+        raise PerceptionError(f"no picture in {', '.join(map(str, paths))}: give {', '.join(SUFFIXES)} files")
+    return {str(file): read_picture(file) for file in files}
+
+
+def read_picture(path: str | Path) -> UInt8[np.ndarray, "rows columns 3"]:
+    """A picture as blue, green and red.
+
+    Raises:
+        PerceptionError: It is missing or cannot be read.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
+    if picture is None:
+        raise PerceptionError(f"cannot read a picture from {path}: give a whole PNG or JPEG file")
+    return picture
+
+
+def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
+    """Whether points do not lie on one line."""
+    return bool(
+        len(points) >= 4 and np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), 1e-6) == 2
+    )

@@ -1,0 +1,307 @@
+"""Square markers: which are in a picture, and where a body that carries them is.
+
+A marker's frame has its origin in the marker's middle, x to the right and y up as one reads it, z out of it. A flat
+square has two poses that look nearly alike from afar; both are kept, for only time can tell them apart.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, Shaped, UInt8
+
+from foretrace.errors import PerceptionError
+from foretrace.geometry import invert_transform, transform_points
+from foretrace.interactions.pinhole import PinholeCamera
+
+FORMAT = "foretrace-markers"
+VERSION = 1
+DICTIONARIES: dict[str, int] = {
+    **{
+        f"{bits}x{bits}_{count}": getattr(cv2.aruco, f"DICT_{bits}X{bits}_{count}")
+        for bits in (4, 5, 6, 7)
+        for count in (50, 100, 250, 1000)
+    },
+    "aruco_original": cv2.aruco.DICT_ARUCO_ORIGINAL,
+    "apriltag_16h5": cv2.aruco.DICT_APRILTAG_16h5,
+    "apriltag_25h9": cv2.aruco.DICT_APRILTAG_25h9,
+    "apriltag_36h10": cv2.aruco.DICT_APRILTAG_36h10,
+    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
+}
+"""OpenCV's dictionaries by the names that users give."""
+DARK = 25
+"""A picture whose brightest hundredth is below this grey value is dark (of 255)."""
+BLURRED = 15.0
+"""A picture whose Laplacian varies by less than this has no sharp edge (grey values squared)."""
+SMALLEST_SIDE = 10.0
+"""A marker of fewer pixels along its shortest side tells no pose."""
+
+CELL = 8
+"""Pixels along a module of the pattern that pictures are aligned with."""
+LARGEST_ALIGNMENT = 3.0
+"""Alignment that moves a corner further than this has gone astray [pixel]."""
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The markers seen in one picture."""
+
+    ids: Int[np.ndarray, " markers"]
+    """Their numbers."""
+    corners: Float[np.ndarray, "markers 4 2"]
+    """Their corners in the picture [pixel], clockwise as one reads the marker, from its upper left."""
+
+    def of(self, id: int) -> Float[np.ndarray, "4 2"] | None:
+        """The corners of one marker, or None where it was not seen, or seen twice."""
+        found = np.flatnonzero(self.ids == id)
+        return self.corners[found[0]] if len(found) == 1 else None
+
+
+def dictionary(name: str) -> cv2.aruco.Dictionary:
+    """A dictionary of markers.
+
+    Raises:
+        PerceptionError: There is none of that name.
+    """
+    if name.lower() not in DICTIONARIES:
+        raise PerceptionError(
+            f"marker dictionary {name!r} is unknown: choose one of {', '.join(DICTIONARIES)}"
+        )
+    return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name.lower()])
+
+
+@lru_cache(maxsize=32)
+def _detector(name: str) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    # A window of at most three tenths of a module: it must not see the marker's own pattern.
+    parameters.cornerRefinementWinSize = 5
+    parameters.relativeCornerRefinmentWinSize = 0.3
+    parameters.cornerRefinementMinAccuracy = 0.005
+    parameters.cornerRefinementMaxIterations = 50
+    return cv2.aruco.ArucoDetector(dictionary(name), parameters)
+
+
+def detect_markers(picture: UInt8[np.ndarray, "rows columns *channels"], name: str) -> Detections:
+    """The markers of a dictionary in a picture (grey, or blue-green-red as OpenCV reads it)."""
+    corners, ids, _ = _detector(name.lower()).detectMarkers(grey(picture))
+    if ids is None or len(ids) == 0:
+        return Detections(np.zeros(0, dtype=int), np.zeros((0, 4, 2)))
+    # OpenCV 4 gives ids as (n, 1), OpenCV 5 as (n,).
+    return Detections(np.ravel(ids).astype(int), np.array(corners, dtype=float).reshape(-1, 4, 2))
+
+
+def align_patterns(
+    picture: UInt8[np.ndarray, "rows columns *channels"], detections: Detections, name: str
+) -> Detections:
+    """Corners found anew from all of each marker's pattern, not from its outer rim alone; slower.
+
+    The known pattern, blurred as far as a pixel blurs, is aligned with the picture (Evangelidis and Psarakis, 2008); a
+    marker that cannot be aligned keeps its corners.
+    """
+    values, found = grey(picture), dictionary(name)
+    modules = found.markerSize + 4  # the code, its black rim and one module of the white margin
+    middle, half = CELL * modules / 2 - 0.5, CELL * (modules - 2) / 2
+    reference = (middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).astype(np.float32)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
+    aligned, everywhere = detections.corners.copy(), np.full(values.shape, 255, np.uint8)
+    for k, (id, corners) in enumerate(zip(detections.ids, detections.corners, strict=True)):
+        marker = cv2.aruco.generateImageMarker(found, int(id), CELL * (modules - 2), borderBits=1)
+        pattern = np.pad(marker, CELL, constant_values=255)
+        pattern = cv2.GaussianBlur(pattern, (0, 0), 2 * half / shortest_side(corners))
+        start = cv2.getPerspectiveTransform(reference, corners.astype(np.float32)).astype(np.float32)
+        try:
+            _, homography = cv2.findTransformECC(
+                pattern, values, start, cv2.MOTION_HOMOGRAPHY, stop, everywhere, 5
+            )
+        except cv2.error:
+            continue
+        moved = cv2.perspectiveTransform(reference[None], homography)[0].astype(float)
+        if np.linalg.norm(moved - corners, axis=1).max() < LARGEST_ALIGNMENT:
+            aligned[k] = moved
+    return Detections(detections.ids, aligned)
+
+
+def grey(picture: Shaped[np.ndarray, "rows columns *channels"]) -> UInt8[np.ndarray, "rows columns"]:
+    """A picture in grey."""
+    return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+
+
+def fitting_dictionaries(picture: UInt8[np.ndarray, "rows columns *channels"]) -> list[str]:
+    """Dictionaries with markers in the picture, those with most first; of nested ones the smallest."""
+    counts: dict[str, int] = {}
+    for name in DICTIONARIES:
+        family, _, size = name.partition("_")
+        nested = "x" in family
+        if nested and size != "1000":  # they are the beginnings of the largest
+            continue
+        if len(ids := detect_markers(picture, name).ids):
+            smallest = min(count for count in (50, 100, 250, 1000) if ids.max() < count) if nested else 0
+            counts[f"{family}_{smallest}" if nested else name] = len(ids)
+    return sorted(counts, key=lambda name: -counts[name])
+
+
+def picture_fault(picture: UInt8[np.ndarray, "rows columns *channels"]) -> str:
+    """What may keep markers from being found in a picture, in words; empty if nothing is apparent."""
+    values = grey(picture)
+    if np.percentile(values, 99) < DARK:
+        return f"it is dark (99 % of the pixels are below {np.percentile(values, 99):.0f} of 255)"
+    sharpness = float(cv2.Laplacian(values, cv2.CV_64F).var())
+    if sharpness < BLURRED:
+        return f"it is blurred or empty (its Laplacian varies by {sharpness:.1f}, below {BLURRED:g})"
+    return ""
+
+
+@dataclass(frozen=True)
+class PoseCandidate:
+    """A pose that explains what was seen of a body."""
+
+    T_camera_body: Float[np.ndarray, "4 4"]
+    """The body in the camera frame."""
+    error: float
+    """Root mean square of the reprojection error [pixel]."""
+
+
+@dataclass(frozen=True)
+class MarkerBody:
+    """A rigid body with markers on it."""
+
+    sides: Mapping[int, float]
+    """Length of each marker's side [m], by the marker's number."""
+    placements: Mapping[int, Float[np.ndarray, "4 4"]]
+    """T_body_marker of each."""
+
+    @classmethod
+    def single(cls, id: int, side: float) -> "MarkerBody":
+        """A body with one marker, whose frame is the body's."""
+        return cls({id: side}, {id: np.eye(4)})
+
+    @property
+    def ids(self) -> list[int]:
+        """The markers' numbers."""
+        return list(self.sides)
+
+    def corners(self, id: int) -> Float[np.ndarray, "4 3"]:
+        """The corners of one marker in the body frame [m], in the order of `Detections`."""
+        return transform_points(self.placements[id], square(self.sides[id]))
+
+    def matches(self, detections: Detections) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]:
+        """Points of the body [m] and where they were seen [pixel]; no rows where no marker was."""
+        seen = [(id, corners) for id in self.ids if (corners := detections.of(id)) is not None]
+        if not seen:
+            return np.zeros((0, 3)), np.zeros((0, 2))
+        return np.concatenate([self.corners(id) for id, _ in seen]), np.concatenate([c for _, c in seen])
+
+    def poses(self, detections: Detections, camera: PinholeCamera) -> list[PoseCandidate]:
+        """Poses that explain the seen markers, the best first: none, one or two.
+
+        The two solutions of the largest marker (Collins and Bartoli, 2014); with several markers in sight each is
+        refined on all corners.
+        """
+        sizes = {id: shortest_side(corners) for id in self.ids if (corners := detections.of(id)) is not None}
+        sizes = {id: size for id, size in sizes.items() if size >= SMALLEST_SIDE}
+        if not sizes:
+            return []
+        largest = max(sizes, key=lambda id: sizes[id])
+        seen = np.asarray(detections.of(largest))
+        matrix, coefficients = camera.matrix, camera.coefficients
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+            square(self.sides[largest]), seen, matrix, coefficients, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+        T_marker_body = invert_transform(self.placements[largest])
+        points, pixels = self.matches(detections)
+        found = []
+        for rvec, tvec in zip(rvecs, tvecs, strict=True):
+            T = to_transform(rvec, tvec) @ T_marker_body
+            if len(sizes) > 1:
+                rotation, _ = cv2.Rodrigues(T[:3, :3])
+                T = to_transform(
+                    *cv2.solvePnPRefineLM(points, pixels, matrix, coefficients, rotation, T[:3, 3:].copy())
+                )
+            error = np.linalg.norm(camera.project(points, T) - pixels, axis=1)
+            if np.isfinite(error).all():
+                found.append(PoseCandidate(T, float(np.sqrt((error**2).mean()))))
+        return sorted(found, key=lambda candidate: candidate.error)
+
+
+def square(side: float) -> Float[np.ndarray, "4 3"]:
+    """Corners of a marker in its own frame [m], clockwise from the upper left."""
+    return side / 2 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
+def shortest_side(corners: Float[np.ndarray, "4 2"]) -> float:
+    """Length of a quadrilateral's shortest side."""
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min())
+
+
+def to_transform(rvec: np.ndarray, tvec: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """OpenCV's rotation and translation vector as a transform."""
+    transform = np.eye(4)
+    transform[:3, :3], _ = cv2.Rodrigues(np.asarray(rvec, dtype=float))
+    transform[:3, 3] = np.ravel(tvec)
+    return transform
+
+
+@dataclass(frozen=True)
+class MarkerLayout:
+    """Which markers are used, on the table and on the object."""
+
+    dictionary: str
+    """Name of their dictionary."""
+    table: MarkerBody
+    """Markers that lie on the table; their frame is the table frame."""
+    object: MarkerBody
+    """Markers on the object, in a frame of their own unless `T_object_body` is known."""
+    T_object_body: Float[np.ndarray, "4 4"] | None = None
+    """Where that frame lies on the object; None: to be found from the picture."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> "MarkerLayout":
+        """The layout in a JSON file.
+
+        Raises:
+            PerceptionError: The file is missing or is no such layout.
+        """
+        try:
+            values = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise PerceptionError(f"marker layout {path} cannot be read ({error})") from error
+        if not isinstance(values, dict) or values.get("format") != FORMAT or values.get("version") != VERSION:
+            raise PerceptionError(
+                f'{path} is no marker layout: it lacks "format": "{FORMAT}", "version": {VERSION}'
+            )
+        try:
+            bodies = {name: _read_body(values[name]) for name in ("table", "object")}
+            pose = _placement(values["object_pose"]) if "object_pose" in values else None
+            layout = cls(str(values["dictionary"]), bodies["table"], bodies["object"], pose)
+        except (KeyError, TypeError, ValueError) as error:
+            raise PerceptionError(
+                f"{path}: {error!r}: give dictionary, table and object, each marker with id and side [m]"
+            ) from error
+        size = dictionary(layout.dictionary).bytesList.shape[0]
+        ids = layout.table.ids + layout.object.ids
+        if len(set(ids)) < len(ids) or not all(0 <= id < size for id in ids):
+            raise PerceptionError(f"{path}: marker ids {ids}: each must be there once, from 0 to {size - 1}")
+        return layout
+
+
+def _read_body(entries: list[dict[str, Any]]) -> MarkerBody:
+    sides = {int(entry["id"]): float(entry["side"]) for entry in entries}
+    if not sides or len(sides) < len(entries) or not all(0.001 <= side <= 1 for side in sides.values()):
+        raise ValueError(f"markers {entries}: ids must differ, sides lie between 0.001 and 1 m")
+    return MarkerBody(sides, {int(entry["id"]): _placement(entry) for entry in entries})
+
+
+def _placement(entry: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """T_body_marker of a marker that lies flat: position [m] and angle about z [degree]."""
+    angle = np.deg2rad(float(entry.get("angle_deg", 0.0)))
+    transform = np.eye(4)
+    transform[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    position = [float(value) for value in entry.get("position", (0.0, 0.0, 0.0))]
+    transform[:3, 3] = [*position, *[0.0] * (3 - len(position))]
+    return transform

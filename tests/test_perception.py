@@ -1,0 +1,255 @@
+"""Cameras, calibration and markers: truth found again, and bad input refused with a reason."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from foretrace.cli import main
+from foretrace.errors import PerceptionError
+from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.calibration import Board, calibrate
+from foretrace.perception.markers import (
+    Detections,
+    MarkerBody,
+    MarkerLayout,
+    align_patterns,
+    detect_markers,
+    fitting_dictionaries,
+    picture_fault,
+    square,
+)
+
+SHARED = Path(__file__).parents[2] / "shared" / "data" / "markers"
+CAMERA = PinholeCamera(640, 480, 600.0, 604.0, 322.0, 236.0, (0.08, -0.15, 0.001, -0.001, 0.05))
+BOARD = Board((6, 5), 0.03, 0.022, "4x4_50")
+
+
+def looking_at(tilt: float, turn: float, distance: float, spin: float = 0.3) -> np.ndarray:
+    """T_camera_board: a board about the optical axis, slanted."""
+    rotation, _ = cv2.Rodrigues(np.array([np.pi + tilt, turn, spin]))
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = [0.01, -0.02, distance]
+    return T
+
+
+def picture_of(
+    texture: np.ndarray, size: tuple[float, float], T: np.ndarray, camera: PinholeCamera
+) -> np.ndarray:
+    """What a camera sees of a flat print whose frame has its origin in the lower left corner: exact per pixel."""
+    columns, rows = np.meshgrid(np.arange(2 * camera.width), np.arange(2 * camera.height))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1) / 2 - 0.25
+    points = camera.on_plane(pixels, invert_transform(T))
+    scale = np.array([texture.shape[1] / size[0], -texture.shape[0] / size[1]])
+    where = (points * scale + [0.0, texture.shape[0]] - 0.5).astype(np.float32)
+    where = where.reshape(*columns.shape, 2)
+    seen = cv2.remap(texture, where[..., 0], where[..., 1], cv2.INTER_AREA, borderValue=200)
+    picture = cv2.resize(seen, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 0.6), cv2.COLOR_GRAY2BGR)
+
+
+def board_pictures(num: int, board: Board = BOARD) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    texture = np.pad(board.draw(6000.0), 60, constant_values=255)
+    size = (board.size[0] + 0.02, board.size[1] + 0.02)
+    pictures = {}
+    for k in range(num):
+        T = looking_at(*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.22, 0.3))
+        T[:3, 3] -= T[:3, :3] @ [size[0] / 2, size[1] / 2, 0.0]
+        pictures[f"picture {k}"] = picture_of(texture, size, T, CAMERA)
+    return pictures
+
+
+def marker_scene(
+    name: str, id: int, side: float, T: np.ndarray, camera: PinholeCamera = CAMERA
+) -> np.ndarray:
+    """A marker with its margin; T is T_camera_marker."""
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
+    modules = markers.markerSize + 2
+    texture = np.pad(
+        cv2.aruco.generateImageMarker(markers, id, 20 * modules, borderBits=1), 20, constant_values=255
+    )
+    size = side * (modules + 2) / modules
+    corner = np.eye(4)
+    corner[:2, 3] = -size / 2
+    return picture_of(texture, (size, size), T @ corner, camera)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> dict[str, np.ndarray]:
+    return board_pictures(8)
+
+
+def test_pixels_and_rays_agree_with_distortion() -> None:
+    pixels = np.array([[3.0, 5.0], [320.5, 200.0], [630.0, 470.0]])
+    np.testing.assert_allclose(CAMERA.project(CAMERA.rays(pixels) * 0.7, np.eye(4)), pixels, atol=1e-4)
+    T = invert_transform(looking_at(0.5, 0.2, 0.7))
+    points = CAMERA.on_plane(pixels, T, 0.02)
+    lifted = np.column_stack([points, np.full(3, 0.02)])
+    np.testing.assert_allclose(CAMERA.project(lifted, invert_transform(T)), pixels, atol=1e-4)
+    assert np.isnan(CAMERA.project(np.array([[0.0, 0.0, -1.0]]), np.eye(4))).all()
+    depth = np.zeros((480, 640))
+    depth[5, 3] = 0.7
+    np.testing.assert_allclose(CAMERA.deproject(depth, np.eye(4)), 0.7 * CAMERA.rays(pixels[:1]), atol=1e-9)
+
+
+def test_camera_files(tmp_path: Path) -> None:
+    CAMERA.save(tmp_path / "camera.json", error_pixels=0.2)
+    assert PinholeCamera.load(tmp_path / "camera.json") == CAMERA
+    good = CAMERA.to_dict()
+    for change, message in (
+        ({"fx": None}, "no number"),
+        ({"fx": -3}, "fx = -3.0, it must be positive"),
+        ({"cx": 900}, "cx = 900.0 lies outside"),
+        ({"distortion": [1, 2]}, "0, 4, 5 or 8"),
+        ({"version": 9}, "format version 9"),
+        ({"format": "x"}, "is no camera"),
+    ):
+        (tmp_path / "bad.json").write_text(json.dumps(good | change))
+        with pytest.raises(PerceptionError, match=message):
+            PinholeCamera.load(tmp_path / "bad.json")
+    del good["cy"]
+    (tmp_path / "bad.json").write_text(json.dumps(good))
+    with pytest.raises(PerceptionError, match="lacks 'cy'"):
+        PinholeCamera.load(tmp_path / "bad.json")
+    with pytest.raises(PerceptionError, match="foretrace calibrate"):
+        PinholeCamera.load(tmp_path / "none.json")
+
+
+def test_calibration_finds_the_camera(pictures: dict[str, np.ndarray]) -> None:
+    found = calibrate(pictures, BOARD)
+    assert found.error < 0.15
+    assert set(found.errors) == set(pictures)
+    # Two cameras are alike if they see along the same lines.
+    pixels = np.stack(np.meshgrid([60.0, 320.0, 580.0], [60.0, 240.0, 420.0]), axis=-1).reshape(-1, 2)
+    apart = np.linalg.norm(found.camera.project(CAMERA.rays(pixels), np.eye(4)) - pixels, axis=1)
+    assert apart.max() < 2.5
+    assert found.camera.fx == pytest.approx(CAMERA.fx, rel=0.005)
+
+
+def test_camera_pose_over_the_board(pictures: dict[str, np.ndarray]) -> None:
+    margin = 0.01
+    T = looking_at(0.5, 0.1, 0.4)
+    size = (BOARD.size[0] + 2 * margin, BOARD.size[1] + 2 * margin)
+    picture = picture_of(np.pad(BOARD.draw(6000.0), 60, constant_values=255), size, T, CAMERA)
+    shift = np.eye(4)
+    shift[:2, 3] = margin
+    truth = invert_transform(T @ shift)
+    found = BOARD.pose(picture, CAMERA)
+    assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 0.001
+    assert rotation_angle(found[:3, :3], truth[:3, :3]) < np.deg2rad(0.2)
+    with pytest.raises(PerceptionError, match="was calibrated for 640 x 480"):
+        BOARD.pose(picture[:400], CAMERA)
+
+
+def test_calibration_refuses_what_it_cannot_use(pictures: dict[str, np.ndarray]) -> None:
+    few = dict(list(pictures.items())[:3])
+    with pytest.raises(PerceptionError, match="3 of 3 pictures show the board, 5 are needed"):
+        calibrate(few, BOARD)
+    with pytest.raises(PerceptionError, match="its markers are of 4x4_50, not 6x6_50"):
+        calibrate(pictures, Board((6, 5), 0.03, 0.022, "6x6_50"))
+    with pytest.raises(PerceptionError, match="odd has 320 x 240 pixels"):
+        calibrate(pictures | {"odd": np.zeros((240, 320, 3), np.uint8)}, BOARD)
+    dark = {f"dark {k}": (picture * 0.05).astype(np.uint8) for k, picture in enumerate(pictures.values())}
+    with pytest.raises(PerceptionError, match="it is dark"):
+        calibrate(dark, BOARD)
+    rows, columns = np.indices((480, 640), dtype=np.float32)
+    waves = 4 * np.sin(rows / 20)
+    wavy = {name: cv2.remap(picture, columns + waves, rows, 1) for name, picture in pictures.items()}
+    with pytest.raises(PerceptionError, match="no camera explains the pictures"):
+        calibrate(wavy, BOARD)
+
+
+def test_calibrate_command(
+    tmp_path: Path, pictures: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, picture in pictures.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), picture)
+    options = ["--squares", "6", "5", "--square-length", "0.03", "--marker-length", "0.022"]
+    options += ["--dictionary", "4x4_50"]
+    assert main(["calibrate", str(tmp_path), *options, "--out", str(tmp_path / "c.json")]) == 0
+    assert "over 8 pictures" in capsys.readouterr().out
+    assert PinholeCamera.load(tmp_path / "c.json").fx == pytest.approx(600, rel=0.01)
+    assert main(["calibrate", "--print-board", str(tmp_path / "b.png"), *options]) == 0
+    assert "180.0 x 150.0 mm" in capsys.readouterr().out
+    printed = cv2.imread(str(tmp_path / "b.png"))
+    assert len(BOARD.find(printed)[0]) == 20
+    assert main(["calibrate", "--print-board", str(tmp_path / "b.pdf"), *options]) == 0
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
+    assert main(["calibrate", str(tmp_path / "nothing.png")]) == 2
+    assert "cannot read a picture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["5x5_100", "apriltag_36h11"])
+def test_a_marker_tells_its_pose(name: str) -> None:
+    T = looking_at(0.6, 0.4, 0.35)
+    picture = marker_scene(name, 7, 0.06, T)
+    found = align_patterns(picture, detect_markers(picture, name), name)
+    assert found.ids.tolist() == [7]
+    np.testing.assert_allclose(found.corners[0], CAMERA.project(square(0.06), T), atol=0.15)
+    best, other = MarkerBody.single(7, 0.06).poses(found, CAMERA)
+    assert np.linalg.norm(best.T_camera_body[:3, 3] - T[:3, 3]) < 0.001
+    assert rotation_angle(best.T_camera_body[:3, :3], T[:3, :3]) < np.deg2rad(0.6)
+    assert best.error < 0.1 < other.error
+    assert fitting_dictionaries(picture)[0].startswith(name.split("_")[0])
+
+
+def test_several_markers_of_one_body_tell_more_than_one() -> None:
+    T = looking_at(0.05, 0.02, 0.5)  # frontal: a single marker is ambiguous here
+    place = pose_to_matrix(np.array([0.12, 0.0, 0.0, 1.0, 0, 0, 0]))
+    body = MarkerBody({1: 0.04, 2: 0.04}, {1: np.eye(4), 2: place})
+    rng = np.random.default_rng(0)
+    corners = np.stack([CAMERA.project(body.corners(id), T) for id in (1, 2)])
+    seen = Detections(np.array([1, 2]), corners + rng.normal(0, 0.1, corners.shape))
+    pose = body.poses(seen, CAMERA)[0].T_camera_body
+    assert rotation_angle(pose[:3, :3], T[:3, :3]) < np.deg2rad(3)
+    assert body.poses(Detections(np.array([5]), corners[:1]), CAMERA) == []
+
+
+def test_what_is_wrong_with_a_picture() -> None:
+    picture = marker_scene("5x5_100", 7, 0.06, looking_at(0.3, 0.2, 0.3))
+    assert picture_fault(picture) == ""
+    assert "dark" in picture_fault(picture // 20)
+    assert "blurred" in picture_fault(cv2.GaussianBlur(picture, (0, 0), 15))
+    with pytest.raises(PerceptionError, match="'9x9' is unknown: choose one of 4x4_50"):
+        detect_markers(picture, "9x9")
+
+
+def test_marker_layouts(tmp_path: Path) -> None:
+    path = tmp_path / "markers.json"
+    entry = {"id": 3, "side": 0.04, "position": [0.1, 0.2], "angle_deg": 90}
+    good = {"format": "foretrace-markers", "version": 1, "dictionary": "4x4_50", "table": [entry]}
+    good["object"] = [{"id": 4, "side": 0.03}]
+    path.write_text(json.dumps(good))
+    layout = MarkerLayout.load(path)
+    np.testing.assert_allclose(layout.table.corners(3)[0], [0.08, 0.18, 0.0], atol=1e-12)
+    for change, message in (
+        ({"object": [{"id": 3, "side": 0.03}]}, "each must be there once"),
+        ({"object": [{"id": 60, "side": 0.03}]}, "from 0 to 49"),
+        ({"object": [{"id": 4, "side": 40}]}, "between 0.001 and 1 m"),
+        ({"object": [{"id": 4}]}, "side"),
+        ({"version": 3}, "no marker layout"),
+    ):
+        path.write_text(json.dumps(good | change))
+        with pytest.raises(PerceptionError, match=message):
+            MarkerLayout.load(path)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason=f"the photographs are not at {SHARED}")
+def test_photographs_of_a_marker_on_a_rotary_stand() -> None:
+    camera = PinholeCamera(1056, 792, 329.873, 332.946, 528.0, 396.0)
+    rotations = {}
+    for path in SHARED.glob("rotary_*.png"):
+        picture = cv2.imread(str(path))
+        seen = align_patterns(picture, detect_markers(picture, "apriltag_36h11"), "apriltag_36h11")
+        poses = MarkerBody.single(int(seen.ids[0]), 0.065).poses(seen, camera)
+        rotations[int(path.stem.split("_")[1])] = poses[0].T_camera_body[:3, :3]
+    turns = {
+        angle: np.rad2deg(rotation_angle(rotations[0], R)) - abs(angle) for angle, R in rotations.items()
+    }
+    assert len(turns) == 6
+    assert max(abs(error) for angle, error in turns.items() if abs(angle) >= 30) < 2.0
