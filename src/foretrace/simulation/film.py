@@ -1,0 +1,356 @@
+"""Films of simulated lever-ups, with markers on object and table, as a camera above a real table would take them."""
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs.
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+import shapely
+from jaxtyping import Float, UInt8
+
+from foretrace.actions import LeverUp
+from foretrace.errors import SimulationError
+from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
+from foretrace.interactions import film_folder
+from foretrace.interactions.film_folder import FilmNotes, Frame, write_film
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.record import Interaction
+from foretrace.objects import ObjectModel
+from foretrace.simulation.engine import Motion
+from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_picture, spoil, spoil_depth
+from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
+from foretrace.simulation.scene import body_origin, build_scene
+
+DICTIONARY = "apriltag_36h11"
+MODULES = 8
+"""Modules along a side of such a marker, its black rim included; a white margin of one goes round it."""
+PICTURE_PIXELS = 40
+"""Pixels along a module of a marker's texture."""
+FINE_PERIOD = 0.01
+"""Time between the states that a film is interpolated from [s]."""
+TABLE_SPOTS = ((0.33, 0.15), (0.33, -0.15), (-0.13, 0.21), (-0.13, -0.21))
+"""Where the table's markers lie in the action frame [m]: clear of any object of 10 cm radius."""
+OBJECT_ID = 10
+OUT_OF_SIGHT = (0.0, 0.0, -5.0)
+FAULTS = Faults()
+"""The usual ones."""
+
+
+@dataclass(frozen=True)
+class FilmConfig:
+    """How a lever-up is filmed."""
+
+    camera: PinholeCamera = WEBCAM
+    """The camera's true intrinsics."""
+    distance: float = 0.7
+    """From the camera to the point on the table that it looks at, before the contact point [m]."""
+    slant: float = 0.6
+    """Angle of its line of sight from the vertical [rad]."""
+    azimuth: float = 1.4
+    """Where it stands about that point, from the action's direction towards its left [rad]."""
+    frames_per_second: float = 30.0
+    """Frames per second."""
+    lead_time: float = 0.4
+    """Time filmed before the blade's path starts [s]."""
+    exposures: int = 2
+    """Moments within a hundredth of a second that are blended into one frame: motion blur."""
+    depth_every: int = 1
+    """Depth is filmed with every so many colour frames; 0: never."""
+    faults: Faults = field(default_factory=Faults)
+    """What spoils the pictures."""
+    table_side: float = 0.05
+    """Side of the table's markers [m]."""
+    largest_side: float = 0.045
+    """Side of the object's marker, if it has room [m]."""
+    simulation: SimulationConfig = field(default_factory=lambda: SimulationConfig(embodiment="tool"))
+    """How the lever-up is simulated; MuJoCo alone can film."""
+
+    def __post_init__(self) -> None:
+        if self.simulation.engine != "mujoco":
+            raise SimulationError(f"engine {self.simulation.engine!r} cannot film: take mujoco")
+        if not 0 < self.frames_per_second <= 100 or self.exposures < 1 or self.lead_time < 0:
+            raise SimulationError(
+                f"film of {self.frames_per_second} frames per second, {self.exposures} exposures, lead of "
+                f"{self.lead_time} s: give up to 100 frames, at least 1 exposure, no negative lead"
+            )
+
+
+@dataclass(frozen=True)
+class FilmTruth:
+    """What a film shows, known exactly."""
+
+    interaction: Interaction
+    """The lever-up that was filmed."""
+    times: Float[np.ndarray, " frame"]
+    """Time stamps [s]."""
+    T_table_object: Float[np.ndarray, "frame 4 4"]
+    """The object in the table frame, frame by frame."""
+    T_table_camera: Float[np.ndarray, "4 4"]
+    """The camera in the table frame."""
+    T_table_action: Float[np.ndarray, "4 4"]
+    """The action frame in the table frame."""
+    action_start: float
+    """Time stamp at which the blade's path starts [s]."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The truth as plain JSON values."""
+        effect = self.interaction.effect
+        return {
+            "object": self.interaction.object.to_dict(),
+            "contact": self.interaction.action.contact.tolist(),
+            "direction": self.interaction.action.direction.tolist(),
+            "outcome": str(effect.outcome),
+            "action_start": self.action_start,
+            "T_table_camera": self.T_table_camera.tolist(),
+            "T_table_action": self.T_table_action.tolist(),
+            "times": self.times.tolist(),
+            "object_poses_in_table": matrix_to_pose(self.T_table_object).tolist(),
+        }
+
+
+def film_lever_up(
+    obj: ObjectModel, action: LeverUp, folder: Path, config: FilmConfig = FilmConfig(), *, seed: int = 0
+) -> FilmTruth:
+    """Films a simulated lever-up into a folder: frames, time stamps, background, marker layout, and the truth.
+
+    The camera's intrinsics are left out: they are to be found by calibration.
+
+    Args:
+        obj: The object.
+        action: The lever-up.
+        folder: An empty or new folder.
+        config: How it is filmed.
+        seed: Seed of the noise, of where the marker sits on the object, and of the clock.
+
+    Raises:
+        SimulationError: The machine cannot render.
+        ActionError: The contact is not on the outline.
+    """
+    rng = np.random.default_rng(seed)
+    simulation = config.simulation
+    interaction = simulate_lever_up(obj, action, simulation, seed=seed)
+    engine = make_engine("mujoco", simulation.embodiment, simulation.timestep, FINE_PERIOD)
+    motion = engine.play(obj, action, simulation.path, simulation.tool, simulation.physics)
+    T_object_marker, side = marker_spot(obj, config.largest_side, rng)
+    T_action_camera = camera_pose(config)
+    spec = build_scene(obj, simulation.physics, simulation.tool, simulation.embodiment, simulation.timestep)
+    T_action_table = _add_markers(spec, obj, T_object_marker, side, config, rng)
+    T_table_action = invert_transform(T_action_table)
+    action_start = round(float(rng.uniform(5.0, 50.0)), 3)
+    count = round((config.lead_time + simulation.path.duration) * config.frames_per_second)
+    times = action_start - config.lead_time + np.arange(count) / config.frames_per_second
+    poses = _interpolate(motion, times - action_start)[0]
+    with LensCamera(spec, config.camera, T_action_camera) as lens:
+        folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / film_folder.BACKGROUND), _background(lens, obj, motion, config, rng))
+        frames = _frames(lens, obj, motion, times, action_start, config, rng)
+        write_film(folder, frames, FilmNotes(action_start=None))
+    truth = FilmTruth(
+        interaction,
+        times,
+        T_table_action @ pose_to_matrix(poses),
+        T_table_action @ T_action_camera,
+        T_table_action,
+        action_start,
+    )
+    layout = _layout(T_table_action, side, config)
+    for name, content in (("truth.json", truth.to_dict()), (film_folder.MARKERS, layout)):
+        (folder / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return truth
+
+
+def film_board(
+    picture: UInt8[np.ndarray, "rows columns"],
+    size: tuple[float, float],
+    camera: PinholeCamera = WEBCAM,
+    num: int = 15,
+    faults: Faults = FAULTS,
+    *,
+    seed: int = 0,
+) -> Iterator[UInt8[np.ndarray, "rows columns 3"]]:
+    """Pictures of a printed board held before a camera, slanted this way and that.
+
+    Args:
+        picture: What is printed on it, in grey.
+        size: Width and height of the print [m].
+        camera: The camera's true intrinsics.
+        num: Number of pictures.
+        faults: What spoils them.
+        seed: Seed of the poses and of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    spec = mujoco.MjSpec()
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.5] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    board = spec.worldbody.add_body(name="board")
+    board.add_freejoint()
+    board.mass, board.inertia, board.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
+    margin = round(0.05 * max(picture.shape))
+    metres = size[0] / picture.shape[1]
+    paper = np.pad(picture, margin, constant_values=255)
+    whole = (metres * paper.shape[1], metres * paper.shape[0])
+    add_picture(board, spec, "board", paper, whole, np.array([0.0, 0, 0, 1, 0, 0, 0]))
+    with LensCamera(spec, camera, np.eye(4)) as lens:
+        for _ in range(num):
+            lens.data.qpos[:] = matrix_to_pose(_held(camera, max(size), rng))
+            yield spoil(lens.colours(), faults, rng.uniform(-1, 1), rng)
+
+
+def _held(camera: PinholeCamera, size: float, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+    """A pose in which a board of that size fills a good part of the picture."""
+    pixel = rng.uniform([0.3, 0.3], [0.7, 0.7]) * [camera.width, camera.height]
+    distance = rng.uniform(1.1, 1.9) * size * camera.fx / camera.width * 1.6
+    turn, _ = cv2.Rodrigues(rng.uniform([-0.6, -0.6, -0.4], [0.6, 0.6, 0.4]))
+    pose = np.eye(4)
+    pose[:3, :3] = turn @ np.diag([1.0, -1.0, -1.0])  # the board faces the camera
+    pose[:3, 3] = distance * camera.rays(pixel[None])[0]
+    return pose
+
+
+def camera_pose(config: FilmConfig) -> Float[np.ndarray, "4 4"]:
+    """T_action_camera: looking at a point 8 cm ahead of the contact point."""
+    aim = np.array([0.08, 0.0, 0.0])
+    horizontal = np.array([np.cos(config.azimuth), np.sin(config.azimuth), 0.0])
+    away = np.sin(config.slant) * horizontal + np.array([0.0, 0.0, np.cos(config.slant)])
+    pose = np.eye(4)
+    right = np.cross([0.0, 0.0, 1.0], horizontal)
+    pose[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
+    pose[:3, 3] = aim + config.distance * away
+    return pose
+
+
+def marker_spot(
+    obj: ObjectModel, largest: float, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Where on an object's top a marker has most room, turned at random: T_object_marker, and its side [m]."""
+    circle = shapely.maximum_inscribed_circle(shapely.Polygon(obj.corners))
+    middle, rim = np.array(circle.coords)
+    half_diagonal = np.linalg.norm(rim - middle)
+    side = min(largest, float(half_diagonal) * np.sqrt(2) * MODULES / (MODULES + 2))
+    angle = rng.uniform(-np.pi, np.pi)
+    pose = np.array([*middle, obj.height + SLAB, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+    return pose_to_matrix(pose), side
+
+
+def marker_picture(id: int) -> UInt8[np.ndarray, "rows columns"]:
+    """A marker with its white margin."""
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    inner = cv2.aruco.generateImageMarker(markers, id, MODULES * PICTURE_PIXELS, borderBits=1)
+    return np.pad(inner, PICTURE_PIXELS, constant_values=255)
+
+
+def _add_markers(
+    spec: mujoco.MjSpec,
+    obj: ObjectModel,
+    T_object_marker: Float[np.ndarray, "4 4"],
+    side: float,
+    config: FilmConfig,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "4 4"]:
+    """Puts the markers into the scene; returns T_action_table, the first table marker's pose."""
+    paper = (MODULES + 2) / MODULES
+    on_body = T_object_marker.copy()
+    on_body[:3, 3] -= body_origin(obj) + np.array([0.0, 0.0, SLAB / 2])
+    add_picture(
+        spec.body("object"),
+        spec,
+        "tag",
+        marker_picture(OBJECT_ID),
+        (paper * side, paper * side),
+        matrix_to_pose(on_body),
+    )
+    angle = rng.uniform(-np.pi, np.pi)
+    turn = np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+    size = (paper * config.table_side, paper * config.table_side)
+    for id, spot in enumerate(TABLE_SPOTS):
+        pose = np.array([*spot, SLAB / 2, *turn])
+        add_picture(spec.worldbody, spec, f"tag_{id}", marker_picture(id), size, pose)
+    return pose_to_matrix(np.array([*TABLE_SPOTS[0], SLAB, *turn]))
+
+
+def _layout(T_table_action: Float[np.ndarray, "4 4"], side: float, config: FilmConfig) -> dict[str, Any]:
+    """The marker layout, as somebody with a ruler would write it."""
+    spots = np.column_stack([TABLE_SPOTS, np.zeros(len(TABLE_SPOTS))])
+    in_table = spots @ T_table_action[:3, :3].T + T_table_action[:3, 3]
+    table = [
+        {
+            "id": id,
+            "side": config.table_side,
+            "position": [round(float(v), 6) for v in spot[:2]],
+            "angle_deg": 0.0,
+        }
+        for id, spot in enumerate(in_table)
+    ]
+    return {
+        "format": "foretrace-markers",
+        "version": 1,
+        "dictionary": DICTIONARY,
+        "table": table,
+        "object": [{"id": OBJECT_ID, "side": side}],
+    }
+
+
+def _interpolate(motion: Motion, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+    """Object and tool poses between the engine's samples, at rest before the first and after the last."""
+    poses = []
+    for values in (motion.object_pose, motion.tool_pose):
+        mixed = np.column_stack([np.interp(times, motion.times, column) for column in values.T])
+        mixed[:, 3:] /= np.linalg.norm(mixed[:, 3:], axis=1, keepdims=True)
+        poses.append(mixed)
+    return poses[0], poses[1]
+
+
+def _frames(
+    lens: LensCamera,
+    obj: ObjectModel,
+    motion: Motion,
+    times: Float[np.ndarray, " frame"],
+    action_start: float,
+    config: FilmConfig,
+    rng: np.random.Generator,
+) -> Iterator[Frame]:
+    phase = rng.uniform(0, 2 * np.pi)
+    offsets = 0.01 * (np.arange(config.exposures) - (config.exposures - 1) / 2) / config.exposures
+    for number, time in enumerate(times):
+        blended = np.zeros((lens.camera.height, lens.camera.width, 3), dtype=np.float32)
+        for offset in offsets:
+            _place(lens, obj, motion, time - action_start + offset)
+            blended += lens.colours() / config.exposures
+        light = np.sin(phase + 2 * np.pi * 0.3 * (time - times[0]))
+        picture = spoil(blended, config.faults, float(light), rng)
+        depth = None
+        if config.depth_every and number % config.depth_every == 0:
+            _place(lens, obj, motion, time - action_start)
+            depth = spoil_depth(lens.depths(), config.faults, rng)
+        yield Frame(round(float(time), 6), picture, depth)
+
+
+def _background(
+    lens: LensCamera, obj: ObjectModel, motion: Motion, config: FilmConfig, rng: np.random.Generator
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """The table before the object was put there, in the mean of some pictures."""
+    _place(lens, obj, motion, 0.0)
+    lens.data.qpos[:3] = OUT_OF_SIGHT
+    perfect = lens.colours()
+    pictures = [spoil(perfect, config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
+    return np.rint(np.mean(pictures, axis=0)).astype(np.uint8)
+
+
+def _place(lens: LensCamera, obj: ObjectModel, motion: Motion, time: float) -> None:
+    """Puts object and tool where they are at a time since the path's start."""
+    pose, tool = (poses[0] for poses in _interpolate(motion, np.array([time])))
+    T_object_body = np.eye(4)
+    T_object_body[:3, 3] = body_origin(obj)
+    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ T_object_body)
+    if motion.joints.shape[1]:
+        joints = [np.interp(time, motion.times, joint) for joint in motion.joints.T]
+    else:
+        joints = [tool[0], tool[2], 2 * np.arctan2(tool[5], tool[3])]
+    lens.data.qpos[7:] = joints
