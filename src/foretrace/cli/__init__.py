@@ -21,6 +21,7 @@ from foretrace.cli.demo import demo
 from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
 from foretrace.cli.figures import figures
 from foretrace.cli.learning import predict, train
+from foretrace.cli.non_flat import evaluate_non_flat
 from foretrace.cli.reconstruction import evaluate_reconstruction
 from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.transfer import evaluate_transfer
@@ -51,6 +52,7 @@ COMMANDS: dict[str, Command | Group] = {
             "reconstruction": evaluate_reconstruction,
             "replay": evaluate_replay,
             "transfer": evaluate_transfer,
+            "non-flat": evaluate_non_flat,
         },
     ),
     "figures": figures,
