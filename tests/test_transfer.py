@@ -165,7 +165,7 @@ def test_the_hull_closes_notches_and_leaves_convex_masks_alone() -> None:
 def test_the_predictor_sees_the_hull_where_it_should(predictor, monkeypatch, hull) -> None:
     seen = []
 
-    def imagine(view, com=None):
+    def imagine(view, com=None, known=None):
         seen.append(view)
         return ImaginedEffect(0.05 * np.arange(60), np.zeros((60, 3)))
 

@@ -28,6 +28,7 @@ def train(
     epochs: int = 15,
     batch_size: int = 32,
     learning_rate: float = 8e-3,
+    known: tuple[str, ...] = (),
     outcomes: tuple[str, ...] = ("levered",),
     split: tuple[int, int, int] | None = None,
     seed: int = 0,
@@ -48,6 +49,7 @@ def train(
         epochs: Passes over the training part; more where it is small, for 300 optimiser steps at least.
         batch_size: Trajectories per optimiser step.
         learning_rate: Adam's largest learning rate; it rises to it and falls to 0.
+        known: Physical constants that the predictor is told beside the view: friction, tool_friction, density.
         outcomes: Outcomes of the interactions to learn from.
         split: Sizes of training, validation and test part; by default the paper's 1400 100 300, or in the same
             proportion where the data set is smaller.
@@ -72,6 +74,7 @@ def train(
         steps_ahead=steps_ahead,
         epochs=epochs,
         batch_size=batch_size,
+        known=known,
         outcomes=outcomes,
         split=split,
         seed=seed,
@@ -97,6 +100,9 @@ def predict(
     edge: int | None = None,
     fraction: float = 0.5,
     contact: tuple[float, float] | None = None,
+    friction: float | None = None,
+    tool_friction: float | None = None,
+    density: float | None = None,
     compare: bool = False,
     animation: bool = True,
     out: Path = Path("prediction"),
@@ -116,6 +122,9 @@ def predict(
         fraction: How far along that edge, between 0 and 1.
         contact: Point to lever at instead, in the object's frame [m]; snapped to the outline. An image's frame has
             its origin at the silhouette's centroid, x to the right and y up.
+        friction: Friction coefficient between object and table, for a predictor that knows it and for --compare.
+        tool_friction: Friction coefficient between object and blade, likewise.
+        density: Density of the object [kg/m^3], likewise.
         compare: Simulate the same lever-up and show truth and error beside the prediction.
         animation: Write an animation as well.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
@@ -124,15 +133,19 @@ def predict(
 
     from foretrace.evaluation.animation import scene_animation
     from foretrace.evaluation.figures import Scene, scene_figure
+    from foretrace.interactions.record import Physics
     from foretrace.predictor import load_predictor
-    from foretrace.simulation.lever_up import simulate_lever_up
+    from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
     predictor = load_predictor(run)
     obj, action, view, com = _object_and_action(polygon, image, scale, mesh, height, edge, fraction, contact)
-    imagined = predictor.imagine(view, com)
+    given = {"friction": friction, "tool_friction": tool_friction, "density": density}
+    physics = _known_physics(given, predictor.known, compare)
+    imagined = predictor.imagine(view, com, {name: physics[name] for name in predictor.known})
     name = f"{predictor.features.label} + LSTM"
     paths = {name: imagined.com_trajectory}
-    truth = simulate_lever_up(obj, action) if compare else None
+    simulation = SimulationConfig(physics=Physics(**physics))
+    truth = simulate_lever_up(obj, action, simulation) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
         title = f"Predicted and simulated lever-up: {truth.effect.outcome}"
         scene = replace(Scene.observed(truth, paths), title=title)
@@ -146,6 +159,26 @@ def predict(
     if truth is not None:
         _print_comparison(imagined.com_trajectory, truth)
     print("\n".join(str(file) for file in sorted(out.iterdir())))
+
+
+def _known_physics(
+    given: dict[str, float | None], knows: tuple[str, ...], simulated: bool
+) -> dict[str, float]:
+    """The constants that the command line names.
+
+    Raises:
+        PredictionError: One that the predictor has to know is missing, one is not above 0, or is of no use.
+    """
+    physics = {name: value for name, value in given.items() if value is not None}
+    for name, value in given.items():
+        option = f"--{name.replace('_', '-')}"
+        if value is None and name in knows:
+            raise PredictionError(f"the predictor has to know {name}: give {option}")
+        if value is not None and not 0 < value < float("inf"):
+            raise PredictionError(f"{option} is {value}: give a number above 0")
+        if value is not None and name not in knows and not simulated:
+            raise PredictionError(f"the predictor does not know {name}: leave {option} out, or --compare")
+    return physics
 
 
 def read_polygon(file: Path) -> "np.ndarray":

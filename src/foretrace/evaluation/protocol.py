@@ -3,7 +3,7 @@
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
@@ -34,6 +34,8 @@ from foretrace.interactions.splits import (
     split_by_seed,
 )
 from foretrace.predictor import EffectPredictor, TrainConfig
+from foretrace.predictor.checkpoint import settings_of
+from foretrace.predictor.known import observed_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import rest_states, valid_lengths, valid_samples
 from foretrace.predictor.training import find_device, fit_predictor, thread_count
@@ -214,7 +216,7 @@ class Recipe:
         """As one level of JSON-able settings."""
         replaced = {"features", "feature_options", "steps_ahead", "outcomes", "split", "seed"}
         replaced |= {"device", "precision", "threads"}
-        settings = {name: value for name, value in asdict(self.training).items() if name not in replaced}
+        settings = {name: value for name, value in settings_of(self.training).items() if name not in replaced}
         options = {label: dict(chosen) for label, chosen in self.feature_options.items()}
         return settings | {"feature_options": options, "proportional": self.proportional}
 
@@ -286,7 +288,10 @@ def measure_errors(
         ``full`` and ``final``, means over the interactions; ``full_median`` and ``final_median``.
     """
     first = rest_states(batch.com[:, 0], predictor.state)
-    imagined = predictor.imagine_states(predictor.compute_features(inputs), first)[..., :3]
+    features = predictor.add_known(
+        predictor.compute_features(inputs), observed_values(batch, predictor.known)
+    )
+    imagined = predictor.imagine_states(features, first)[..., :3]
     truth = np.where(valid_samples(batch)[..., None], batch.com, np.nan)
     errors = {name: 100 * np.asarray(distance(imagined, truth)) for name, distance in METRICS.items()}
     means = {name: float(np.mean(values)) for name, values in errors.items()}

@@ -7,7 +7,7 @@ are noisy, and samples are taken at another rate. All of it is drawn anew for ev
 show is what no simulator models: bending, screws that loosen, a table that is not flat.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import cv2
 import numpy as np
@@ -107,7 +107,7 @@ class StandIn:
     @classmethod
     def undisturbed(cls, engine: str = "mujoco", embodiment: str = "arm") -> "StandIn":
         """No difference from the simulator in training but, if asked for, the engine."""
-        same = {field.name: 0.0 for field in fields(cls) if isinstance(field.default, float)} | {
+        same = {each.name: 0.0 for each in fields(cls) if isinstance(each.default, float)} | {
             "friction": (Physics.friction,) * 2,
             "tool_friction": (Physics.tool_friction,) * 2,
             "density_factor": (1.0, 1.0),
@@ -177,6 +177,7 @@ class StandIn:
             slip_time=None if effect.slip_index is None else float(effect.times[effect.slip_index]),
             outcome=effect.outcome,
             perturbation=drawn,
+            physics=physics,
         )
 
     def _see(
@@ -219,6 +220,8 @@ class Observation:
     """What became of the object."""
     perturbation: Perturbation
     """What was different."""
+    physics: Physics = field(default_factory=Physics)
+    """Friction and density as they really were."""
 
 
 def hull_of(view: TopDownView) -> TopDownView:

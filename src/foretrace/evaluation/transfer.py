@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from foretrace.errors import PredictionError, ShapeError, SimulationError
 from foretrace.evaluation.stand_in import Observation, StandIn, hull_of
 from foretrace.evaluation.transfer_objects import Played, Subject, play
-from foretrace.interactions.record import Interaction
+from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor.base import EffectPredictor
 from foretrace.trajectories import warped_distance
@@ -111,12 +111,23 @@ def evaluate_transfer(
 
 
 def compare(
-    predictor: EffectPredictor, view: TopDownView, observed: Observation, simulated: Interaction
+    predictor: EffectPredictor,
+    view: TopDownView,
+    observed: Observation,
+    simulated: Interaction,
+    told: Physics | None = None,
 ) -> tuple[dict[str, Any], Float[np.ndarray, "time 3"]]:
     """Distances of one observed path from the simulated and the imagined one.
 
     As in the paper, the roll-out starts where the marker is seen before the action. How much of the distance that
     start takes away is told by ``distance_predicted_from_view_cm``, where it is estimated from the view.
+
+    Args:
+        predictor: The predictor.
+        view: What it sees.
+        observed: What the stand-in showed.
+        simulated: What the simulator of the training data made of it.
+        told: What a predictor that knows physical constants is told of them; by default the stand-in's own.
 
     Returns:
         The outcomes and distances [cm] as a part of a row; and the imagined path, cut where the observed one ends [m].
@@ -134,9 +145,11 @@ def compare(
     }
     if len(observed.com) == 0:
         return row, np.empty((0, 3))
-    start = predictor.imagine(view, observed.com[0])
+    physics = observed.physics if told is None else told
+    known = {name: getattr(physics, name) for name in predictor.known}
+    start = predictor.imagine(view, observed.com[0], known)
     imagined = start.com_trajectory[_before(start.times, slip)]
-    blind = predictor.imagine(view)
+    blind = predictor.imagine(view, known=known)
     row["distance_predicted_cm"] = distance_until_slip(observed, start.times, start.com_trajectory)
     row["distance_predicted_from_view_cm"] = distance_until_slip(observed, blind.times, blind.com_trajectory)
     row["final_predicted_cm"] = CM * float(np.linalg.norm(imagined[-1] - observed.com[-1]))

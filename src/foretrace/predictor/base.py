@@ -1,7 +1,7 @@
 """What a predictor is: the contract between training, checkpoints and everybody who imagines effects."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -15,6 +15,7 @@ from foretrace.errors import PredictionError
 from foretrace.features import FeatureExtractor, Precision
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, TopDownView
+from foretrace.predictor.known import check_names, given_values, observed_values
 from foretrace.predictor.states import StateKind, decode_poses, rest_states, state_size
 
 ROWS_AT_ONCE = 256
@@ -66,6 +67,7 @@ class EffectPredictor(nn.Module, ABC):
         features: What it knows about the object.
         state: What it predicts.
         num_samples: Samples in an imagined trajectory.
+        known: Physical constants that it is told beside the view: some of `known.KNOWN`.
     """
 
     label: ClassVar[str]
@@ -73,14 +75,22 @@ class EffectPredictor(nn.Module, ABC):
     state_mean: Tensor
     state_scale: Tensor
     times: Tensor
+    known_mean: Tensor
+    known_scale: Tensor
 
-    def __init__(self, features: FeatureExtractor, state: StateKind, num_samples: int):
+    def __init__(
+        self, features: FeatureExtractor, state: StateKind, num_samples: int, known: Sequence[str] = ()
+    ):
         super().__init__()
         self.features = features
         self.state: StateKind = state
         self.register_buffer("state_mean", torch.zeros(state_size(state)))
         self.register_buffer("state_scale", torch.ones(state_size(state)))
         self.register_buffer("times", torch.zeros(num_samples, dtype=torch.float64))
+        self.known = check_names(known)
+        if self.known:  # a predictor that knows nothing has the tensors of older checkpoints
+            self.register_buffer("known_mean", torch.zeros(len(known)))
+            self.register_buffer("known_scale", torch.ones(len(known)))
 
     @property
     @abstractmethod
@@ -90,15 +100,18 @@ class EffectPredictor(nn.Module, ABC):
     @abstractmethod
     def training_loss(
         self,
-        features: Float[Tensor, "batch features"],
+        features: Float[Tensor, "batch inputs"],
         states: Float[Tensor, "batch time state"],
         lengths: Int[Tensor, " batch"],
     ) -> Float[Tensor, ""]:
-        """The error to minimise on normalised states, of which row ``i`` is valid up to ``lengths[i]``."""
+        """The error to minimise on normalised states, of which row ``i`` is valid up to ``lengths[i]``.
+
+        ``features`` are those of the object and, behind them, what is known: as from `add_known`.
+        """
 
     @abstractmethod
     def roll_out(
-        self, features: Float[Tensor, "batch features"], first: Float[Tensor, "batch state"]
+        self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch time state"]:
         """Whole trajectories of normalised states from the first state alone, ``first`` included."""
 
@@ -111,6 +124,11 @@ class EffectPredictor(nn.Module, ABC):
     def num_samples(self) -> int:
         """Samples in an imagined trajectory."""
         return len(self.times)
+
+    @property
+    def num_inputs(self) -> int:
+        """Features of the object, and what is known."""
+        return self.features.num_features + len(self.known)
 
     @property
     def device(self) -> torch.device:
@@ -132,21 +150,46 @@ class EffectPredictor(nn.Module, ABC):
         self.state_scale.copy_(torch.from_numpy(scale))
         self.times.copy_(torch.from_numpy(times))
 
+    def set_known(self, values: Float[np.ndarray, "batch known"]) -> None:
+        """Fix how known values are standardised: by mean and deviation of the training part's."""
+        if self.known:
+            mean, scale = values.mean(axis=0), values.std(axis=0)
+            self.known_mean.copy_(torch.from_numpy(mean))
+            # What is the same everywhere tells nothing apart: it is only shifted.
+            same = scale <= 1e-9 * np.abs(mean)
+            self.known_scale.copy_(torch.from_numpy(np.where(same, 1.0, scale)))
+
+    def add_known(
+        self, features: Float[Tensor, "batch features"], values: Float[np.ndarray, "batch known"]
+    ) -> Float[Tensor, "batch inputs"]:
+        """What the network is given: features of objects, and behind them known values, standardised."""
+        if not self.known:
+            return features
+        known = torch.as_tensor(values, dtype=torch.float32, device=self.device)
+        return torch.cat([features, (known - self.known_mean) / self.known_scale], dim=1)
+
     def normalise(self, states: Float[np.ndarray, "*batch state"]) -> Float[Tensor, "*batch state"]:
         """States in metres as the network sees them."""
         states32 = torch.as_tensor(states, dtype=torch.float32, device=self.device)
         return (states32 - self.state_mean) / self.state_scale
 
-    def imagine(self, view: TopDownView, com: Float[np.ndarray, "3"] | None = None) -> ImaginedEffect:
+    def imagine(
+        self,
+        view: TopDownView,
+        com: Float[np.ndarray, "3"] | None = None,
+        known: Mapping[str, float] | None = None,
+    ) -> ImaginedEffect:
         """Imagine the effect of the action on the object in a view.
 
         Args:
             view: The object from above, in the action frame.
             com: Its centre of mass at rest in the action frame [m]. Estimated from the view if not given:
                 above the centre of the mask's area, at half the object's greatest height.
+            known: Values of the constants that the predictor was trained to know, by name [SI].
 
         Raises:
-            PredictionError: The predictor's features are only known after the action.
+            PredictionError: The predictor's features are only known after the action; or a known value is missing,
+                is not finite, or is none that the predictor knows.
         """
         if self.features.oracle:
             raise PredictionError(
@@ -155,21 +198,28 @@ class EffectPredictor(nn.Module, ABC):
             )
         batch = InteractionBatch.from_views([view])
         start = estimate_com(batch) if com is None else np.asarray(com, dtype=float)[None]
-        return self._imagine_from(self.features.inputs(batch), start)[0]
+        values = given_values(known, self.known)
+        return self._imagine_from(self.features.inputs(batch), values, start)[0]
 
     def imagine_batch(self, batch: InteractionBatch, start: Start = "observed") -> ImaginedBatch:
         """Imagine the effects of many actions.
 
         Args:
             batch: The interactions; of their trajectories only the first sample is read, and not even that if
-                ``start`` is ``estimated``.
+                ``start`` is ``estimated``. Their constants are read if the predictor knows them.
             start: Whether the roll-out starts from the recorded first state or from the view's estimate.
+
+        Raises:
+            PredictionError: A constant that the predictor knows is not recorded.
         """
         com = batch.com[:, 0] if start == "observed" else estimate_com(batch)
-        return self._imagine_from(self.features.inputs(batch), com)
+        return self._imagine_from(self.features.inputs(batch), observed_values(batch, self.known), com)
 
-    def _imagine_from(self, inputs: Shaped[Tensor, "batch ..."], com: np.ndarray) -> ImaginedBatch:
-        states = self.imagine_states(self.compute_features(inputs), rest_states(com, self.state))
+    def _imagine_from(
+        self, inputs: Shaped[Tensor, "batch ..."], known: np.ndarray, com: np.ndarray
+    ) -> ImaginedBatch:
+        features = self.add_known(self.compute_features(inputs), known)
+        states = self.imagine_states(features, rest_states(com, self.state))
         pose = decode_poses(states) if self.state == "pose" else None
         return ImaginedBatch(self.times.cpu().numpy(), states[..., :3], pose)
 
@@ -179,9 +229,9 @@ class EffectPredictor(nn.Module, ABC):
             return torch.cat([self.features(part.to(self.device)) for part in inputs.split(ROWS_AT_ONCE)])
 
     def imagine_states(
-        self, features: Float[Tensor, "batch features"], first: Float[np.ndarray, "batch state"]
+        self, features: Float[Tensor, "batch inputs"], first: Float[np.ndarray, "batch state"]
     ) -> Float[np.ndarray, "batch time state"]:
-        """Roll out states in the action frame [m] from features and first states."""
+        """Roll out states in the action frame [m] from what `add_known` gives and first states."""
         with _evaluating(self):
             rolled = self.roll_out(features, self.normalise(first))
             states = (rolled.double() * self.state_scale + self.state_mean).cpu().numpy()

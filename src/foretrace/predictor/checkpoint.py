@@ -25,6 +25,20 @@ PREDICTORS: dict[str, tuple[type[LstmPredictor], type[LstmConfig]]] = {
     LstmPredictor.label: (LstmPredictor, LstmConfig)
 }
 """Every kind of predictor by its label, with the class of its settings."""
+ADDED_SETTINGS: dict[str, Any] = {"known": ()}
+"""Settings that older checkpoints and results do not name, and what they were in effect."""
+
+
+def settings_of(config: Any) -> dict[str, Any]:
+    """The settings in a dataclass by name; those that were added later only where they make a difference.
+
+    So what was written before they were added equals what would be written now.
+    """
+    return {
+        name: value
+        for name, value in asdict(config).items()
+        if name not in ADDED_SETTINGS or value != ADDED_SETTINGS[name]
+    }
 
 
 def describe(predictor: EffectPredictor) -> dict[str, Any]:
@@ -33,7 +47,7 @@ def describe(predictor: EffectPredictor) -> dict[str, Any]:
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "predictor": predictor.label,
-        "settings": asdict(predictor.config),
+        "settings": settings_of(predictor.config),
         "features": {"label": predictor.features.label, "options": predictor.features.options},
         "num_samples": predictor.num_samples,
     }
@@ -147,10 +161,12 @@ def _make(config: Mapping[str, Any], file: Path) -> EffectPredictor:
     known = {f.name for f in fields(settings_kind)}
     try:
         settings, features, num_samples = config["settings"], config["features"], config["num_samples"]
+        settings = {name: value for name, value in ADDED_SETTINGS.items() if name in known} | settings
         if odd := sorted(known ^ settings.keys()):
             raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
         extractor = make_features(features["label"], **features["options"])
-        return kind(extractor, num_samples, settings_kind(**settings))
+        tuples = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
+        return kind(extractor, num_samples, settings_kind(**settings | tuples))
     except TrainingError as error:
         raise CheckpointError(f"{file}: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:

@@ -31,6 +31,8 @@ class LstmConfig:
     residual: bool = True
     """Whether the dense layer says by how much the n next states differ from the current one, instead of the
     states themselves as in the paper."""
+    known: tuple[str, ...] = ()
+    """Physical constants that are told beside the view."""
 
 
 class ProjectedLstm(nn.Module):
@@ -192,10 +194,10 @@ class LstmPredictor(EffectPredictor):
 
     def __init__(self, features: FeatureExtractor, num_samples: int, config: LstmConfig | None = None):
         config = config or LstmConfig()
-        super().__init__(features, config.state, num_samples)
+        super().__init__(features, config.state, num_samples, config.known)
         self._config = config
         size = state_size(config.state)
-        self.lstm = ProjectedLstm(size, features.num_features, config.hidden)
+        self.lstm = ProjectedLstm(size, self.num_inputs, config.hidden)
         self.output = nn.Linear(config.hidden, config.steps_ahead * size)
         nn.init.xavier_uniform_(self.output.weight)
         nn.init.zeros_(self.output.bias)
@@ -217,7 +219,7 @@ class LstmPredictor(EffectPredictor):
 
     def training_loss(
         self,
-        features: Float[Tensor, "batch features"],
+        features: Float[Tensor, "batch inputs"],
         states: Float[Tensor, "batch time state"],
         lengths: Int[Tensor, " batch"],
     ) -> Float[Tensor, ""]:
@@ -241,7 +243,7 @@ class LstmPredictor(EffectPredictor):
         return ((predicted - targets).square().mean(-1) * valid).sum() / valid.sum()
 
     def roll_out(
-        self, features: Float[Tensor, "batch features"], first: Float[Tensor, "batch state"]
+        self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch time state"]:
         """Feed predictions back, n states per iteration, until the trajectory is whole."""
         projected = self.lstm.project(features)

@@ -7,7 +7,7 @@ import io
 import json
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,7 @@ class RunFolder:
         Raises:
             TrainingError: The folder holds a training of another configuration, or something else.
         """
-        config = describe(predictor) | {"training": json.loads(json.dumps(training))}
+        config = json.loads(json.dumps(describe(predictor) | {"training": training}))
         if resume and (self.path / CONFIG).is_file():
             self._check(config)
             return
@@ -169,13 +169,15 @@ class RunFolder:
         (self.path / RESUME).unlink(missing_ok=True)
 
 
-def fingerprint(batch: InteractionBatch) -> str:
-    """A short hash of everything in a batch that a training can read."""
+def fingerprint(batch: InteractionBatch, known: Sequence[str] = ()) -> str:
+    """A short hash of everything in a batch that a training can read, and of those constants that it knows."""
     digest = hashlib.sha256()
     for name in ("ids", "mask", "height", "times", "com", "pose", "length", "slip_index"):
         digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
     digest.update(np.ascontiguousarray(batch.support_points).tobytes())
     digest.update("\n".join(batch.outcome.tolist()).encode())
+    for name in known:
+        digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
     return digest.hexdigest()[:16]
 
 

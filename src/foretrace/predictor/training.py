@@ -21,9 +21,10 @@ from foretrace.features.fitting import learning_rate
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.checkpoint import load_tensors, read_tensors
+from foretrace.predictor.checkpoint import load_tensors, read_tensors, settings_of
 from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.files import write_tensors
+from foretrace.predictor.known import check_names, observed_values
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
@@ -55,6 +56,8 @@ class TrainConfig:
     """States per training sequence; the LSTM's memory is carried on to the next one."""
     residual: bool = True
     """Whether the network predicts changes of the state, instead of states as in the paper."""
+    known: tuple[str, ...] = ()
+    """Physical constants that the predictor is told beside the view, by the names of `Physics`."""
     epochs: int = 15
     """Passes over the training part, unless ``min_steps`` asks for more."""
     min_steps: int = 300
@@ -82,6 +85,7 @@ class TrainConfig:
                 raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.learning_rate > 0:
             raise TrainingError(f"learning_rate must be positive, not {self.learning_rate}")
+        check_names(self.known)
 
     def num_epochs(self, size: int) -> int:
         """Passes over a training part of so many interactions."""
@@ -90,7 +94,9 @@ class TrainConfig:
     def make_predictor(self, num_samples: int) -> EffectPredictor:
         """The untrained predictor that these settings ask for."""
         features = make_features(self.features, **self.feature_options)
-        settings = LstmConfig(self.state, self.steps_ahead, self.hidden, self.window, self.residual)
+        settings = LstmConfig(
+            self.state, self.steps_ahead, self.hidden, self.window, self.residual, self.known
+        )
         return LstmPredictor(features, num_samples, settings)
 
 
@@ -101,6 +107,8 @@ class _Part:
     batch: InteractionBatch
     inputs: Tensor
     """Inputs of the features."""
+    known: np.ndarray
+    """(batch, known) constants that the predictor is told [SI]."""
     states: np.ndarray
     """(batch, time, state) in the action frame [m], zeros past the valid length."""
 
@@ -177,8 +185,8 @@ def train_predictor(
     folder = RunFolder(out)
     with thread_count(config.threads), _made(config, batch) as predictor:
         surroundings = ("device", "threads", "precision")
-        training = {name: value for name, value in asdict(config).items() if name not in surroundings}
-        training |= {"data": fingerprint(batch), "rows": _hash_split(split)}
+        training = {name: value for name, value in settings_of(config).items() if name not in surroundings}
+        training |= {"data": fingerprint(batch, config.known), "rows": _hash_split(split)}
         folder.start(predictor, training, resume)
         if folder.finished:
             return folder.path
@@ -235,6 +243,7 @@ class _Training:
         valid = valid_samples(train.batch)
         mean, scale = state_statistics(train.states, valid, predictor.state)
         predictor.set_normalisation(mean, scale, train.batch.times)
+        predictor.set_known(train.known)
         self.states = (
             predictor.normalise(train.states) * torch.from_numpy(valid).to(predictor.device)[..., None]
         )
@@ -288,7 +297,7 @@ class _Training:
             write_tensors(file, features.state_dict())
 
     def _features_of(self, part: _Part) -> Tensor:
-        return self.predictor.compute_features(part.inputs)
+        return self.predictor.add_known(self.predictor.compute_features(part.inputs), part.known)
 
     def _epoch(self, epoch: int, fixed: Tensor | None) -> float:
         """One pass over the training part; the mean loss. ``fixed`` are features that do not change."""
@@ -303,9 +312,11 @@ class _Training:
                 rate = learning_rate(self.config.learning_rate, share)
                 for group in optimizer.param_groups:
                     group["lr"] = rate * group["share"]
-                features = (
-                    predictor.features(self.train.inputs[rows].to(device)) if fixed is None else fixed[rows]
-                )
+                if fixed is None:
+                    features = predictor.features(self.train.inputs[rows].to(device))
+                    features = predictor.add_known(features, self.train.known[rows.numpy()])
+                else:
+                    features = fixed[rows]
                 loss = predictor.training_loss(features, self.states[rows], self.lengths[rows])
                 optimizer.zero_grad()
                 loss.backward()
@@ -363,7 +374,8 @@ def _hash_split(split: Split) -> str:
 
 def _prepare(batch: InteractionBatch, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
     inputs = predictor.features.inputs(batch) if inputs is None else inputs
-    return _Part(batch, inputs, encode_states(batch, predictor.state))
+    known = observed_values(batch, predictor.known)
+    return _Part(batch, inputs, known, encode_states(batch, predictor.state))
 
 
 @contextmanager

@@ -1,0 +1,62 @@
+"""Physical constants that a predictor may be told before the action, beside what it sees (paper, section 6)."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from foretrace.errors import PredictionError, TrainingError
+from foretrace.interactions.dataset import InteractionBatch
+
+KNOWN = {"friction": "of object and table", "tool_friction": "of object and blade", "density": "in kg/m^3"}
+"""What can be known, by the names of `Physics`."""
+
+
+def check_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of what a predictor is to know, each once.
+
+    Raises:
+        TrainingError: One of them cannot be known, or comes twice.
+    """
+    for name in names:
+        if name not in KNOWN:
+            raise TrainingError(f"{name!r} cannot be known to a predictor: choose from {', '.join(KNOWN)}")
+        if list(names).count(name) > 1:
+            raise TrainingError(f"{name!r} is named twice among what is known: name it once")
+    return tuple(names)
+
+
+def observed_values(batch: InteractionBatch, names: Sequence[str]) -> Float[np.ndarray, "batch known"]:
+    """What is recorded of interactions, in SI units.
+
+    Raises:
+        PredictionError: One of them lacks a value.
+    """
+    values = np.array([getattr(batch, name) for name in names], dtype=float).reshape(len(names), len(batch)).T
+    rows, columns = np.nonzero(~np.isfinite(values))
+    if len(rows):
+        name = names[columns[0]]
+        raise PredictionError(
+            f"interaction {batch.ids[rows[0]]} has {name} = {values[rows[0], columns[0]]}: record its {name}, leave "
+            f"it out, or use a predictor that does not know {name}"
+        )
+    return values
+
+
+def given_values(values: Mapping[str, float] | None, names: Sequence[str]) -> Float[np.ndarray, "1 known"]:
+    """What somebody says of one action, in SI units.
+
+    Raises:
+        PredictionError: A value is missing, is no finite number, or is not known to the predictor.
+    """
+    values = {} if values is None else values
+    if missing := [name for name in names if name not in values]:
+        wanted = ", ".join(f"{name!r}: value {KNOWN[name]}" for name in names)
+        raise PredictionError(f"the predictor has to know {', '.join(missing)}: give known={{{wanted}}}")
+    if odd := [name for name in values if name not in names]:
+        knows = ", ".join(names) or "nothing but the view"
+        raise PredictionError(f"the predictor knows {knows}, not {odd[0]!r}: leave it out of known")
+    for name in names:
+        if not np.isfinite(values[name]):
+            raise PredictionError(f"known {name} is {values[name]}: give a finite value {KNOWN[name]}")
+    return np.array([[values[name] for name in names]], dtype=float).reshape(1, len(names))

@@ -1,0 +1,196 @@
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from factories import fake_batch
+from foretrace.cli.learning import _known_physics
+from foretrace.errors import CheckpointError, PredictionError, TrainingError
+from foretrace.evaluation.protocol import Recipe, measure_errors
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.splits import split_by_seed
+from foretrace.interactions.topdown import TopDownView
+from foretrace.predictor import TrainConfig, load_predictor, train_predictor
+from foretrace.predictor.checkpoint import read_config
+from foretrace.predictor.run_folder import fingerprint
+from foretrace.predictor.training import fit_predictor
+
+NAMES = ("friction", "density")
+CONFIG = TrainConfig(features="none", hidden=16, epochs=3, min_steps=1, split=None, window=6, device="cpu")
+KNOWING = replace(CONFIG, known=NAMES)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def batch() -> InteractionBatch:
+    """Objects lift the less the higher the friction: only who knows it can tell."""
+    rng = np.random.default_rng(7)
+    made = fake_batch(rng, 40, num_samples=20)
+    friction, density = rng.uniform(0.4, 1.2, 40), rng.uniform(300, 1200, 40)
+    rest = made.com[:, :1]
+    com = rest + (made.com - rest) * (1.3 - friction)[:, None, None]
+    return replace(made, friction=friction, density=density, com=com)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, batch):
+    return train_predictor(batch, KNOWING, tmp_path_factory.mktemp("known") / "run", progress=False)
+
+
+def view_of(batch: InteractionBatch, k: int) -> TopDownView:
+    return TopDownView(batch.mask[k], batch.height[k])
+
+
+def test_what_is_known_is_standardised_by_the_training_part(run, batch):
+    tensors = load_file(run / "model.safetensors")
+    train = json.loads((run / "split.json").read_text())["train"]  # ids are row numbers here
+    for k, name in enumerate(NAMES):
+        values = getattr(batch, name)[train]
+        assert tensors["known_mean"][k] == pytest.approx(values.mean())
+        assert tensors["known_scale"][k] == pytest.approx(values.std())
+    predictor = load_predictor(run)
+    values = np.stack([batch.friction, batch.density], axis=1)[train]
+    inputs = predictor.add_known(torch.zeros(len(values), 0), values)
+    torch.testing.assert_close(inputs.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(inputs.std(0, correction=0), torch.ones(2))
+
+
+def test_constants_that_never_vary_are_only_shifted(batch):
+    same = replace(batch, friction=np.full(40, 0.8), density=np.full(40, 600.0))
+    predictor, _ = fit_predictor(same, KNOWING, split_by_seed(40, 0, None))
+    assert predictor.known_scale.tolist() == [1.0, 1.0]
+    assert np.isfinite(predictor.imagine_batch(same).com).all()
+
+
+def test_a_saved_predictor_imagines_the_same_alone_and_in_a_batch(run, batch):
+    predictor = load_predictor(run)
+    assert predictor.known == NAMES
+    whole = predictor.imagine_batch(batch).com
+    for k in (0, 17):
+        known = {"friction": float(batch.friction[k]), "density": float(batch.density[k])}
+        alone = predictor.imagine(view_of(batch, k), batch.com[k, 0], known)
+        np.testing.assert_allclose(alone.com_trajectory, whole[k], atol=1e-6)
+    other = predictor.imagine(view_of(batch, 0), batch.com[0, 0], {"friction": 0.1, "density": 600.0})
+    assert np.abs(other.com_trajectory - whole[0]).max() > 1e-5
+
+
+def test_knowing_helps_where_it_decides(batch):
+    """Without a feature that tells them apart, only friction explains how far objects are lifted."""
+    split = split_by_seed(40, 0, None)
+    errors = {}
+    for known in ((), ("friction",)):
+        config = replace(CONFIG, known=known, hidden=32, epochs=60)
+        predictor, _ = fit_predictor(batch, config, split)
+        inputs = predictor.features.inputs(batch)
+        errors[known] = measure_errors(predictor, batch[split.train], inputs[split.train])["full"]
+    assert errors[("friction",)] < 0.9 * errors[()]
+
+
+def test_an_interrupted_training_goes_on_and_another_one_is_refused(tmp_path, run, batch):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    train_predictor(batch, KNOWING, folder, progress=False)
+    with pytest.raises(TrainingError, match=r"settings\.known = \['friction', 'density'\], not None"):
+        train_predictor(batch, CONFIG, folder, progress=False)
+    assert fingerprint(batch, NAMES) != fingerprint(batch)
+    heavier = replace(batch, density=2 * batch.density)
+    assert fingerprint(heavier) == fingerprint(batch)
+    with pytest.raises(TrainingError, match=r"training\.data"):
+        train_predictor(heavier, KNOWING, folder, progress=False)
+
+
+def test_who_knows_nothing_is_written_as_before(tmp_path, batch):
+    run = train_predictor(batch, CONFIG, tmp_path / "run", progress=False)
+    config = read_config(run)
+    assert "known" not in config["settings"]
+    assert "known" not in config["training"]
+    assert not [name for name in load_file(run / "model.safetensors") if "known" in name]
+    assert load_predictor(run).known == ()
+    assert "known" not in Recipe().describe()
+    assert Recipe(KNOWING).describe()["known"] == NAMES
+
+
+# --- bad input ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        (
+            None,
+            r"has to know friction, density: give known=\{'friction': value of object and table, 'density'",
+        ),
+        ({"friction": 0.8}, "has to know density: give known="),
+        ({"friction": 0.8, "density": float("nan")}, r"known density is nan: give a finite value in kg/m\^3"),
+        (
+            {"friction": 0.8, "density": 600.0, "colour": 3.0},
+            "knows friction, density, not 'colour': leave it out",
+        ),
+    ],
+)
+def test_what_is_missing_unknown_or_not_finite_is_refused(run, batch, known, message):
+    with pytest.raises(PredictionError, match=message):
+        load_predictor(run).imagine(view_of(batch, 0), known=known)
+
+
+def test_values_for_a_predictor_that_knows_nothing_are_refused(batch):
+    predictor = CONFIG.make_predictor(20)
+    with pytest.raises(PredictionError, match="knows nothing but the view, not 'friction'"):
+        predictor.imagine(view_of(batch, 0), known={"friction": 0.8})
+
+
+def test_interactions_without_a_record_are_named(run, batch):
+    unknown = replace(batch, density=np.where(batch.ids == 11, np.nan, batch.density))
+    message = (
+        "interaction 11 has density = nan: record its density, leave it out, or use a predictor that does not"
+    )
+    with pytest.raises(PredictionError, match=message):
+        load_predictor(run).imagine_batch(unknown)
+    with pytest.raises(PredictionError, match=message):
+        fit_predictor(unknown, KNOWING, split_by_seed(40, 0, None))
+    fit_predictor(unknown, replace(CONFIG, epochs=1), split_by_seed(40, 0, None))
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [(("mass",), "'mass' cannot be known .* choose from friction"), (("density", "density"), "named twice")],
+)
+def test_impossible_names_are_refused(known, message):
+    with pytest.raises(TrainingError, match=message):
+        TrainConfig(known=known)
+
+
+def test_a_checkpoint_that_knows_nonsense_is_refused(tmp_path, run):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    config = json.loads((folder / "config.json").read_text())
+    config["settings"]["known"] = ["friction", "mass"]
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="'mass' cannot be known"):
+        load_predictor(folder)
+    del config["settings"]["known"]
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="unexpected tensors known_mean, known_scale"):
+        load_predictor(folder)
+
+
+@pytest.mark.parametrize(
+    ("given", "knows", "simulated", "message"),
+    [
+        ({"friction": None}, ("friction",), False, "has to know friction: give --friction"),
+        ({"tool_friction": 0.0}, ("tool_friction",), False, "--tool-friction is 0.0: give a number above 0"),
+        ({"density": 600.0}, (), False, "does not know density: leave --density out"),
+    ],
+)
+def test_options_of_predict_are_checked(given, knows, simulated, message):
+    with pytest.raises(PredictionError, match=message):
+        _known_physics(given, knows, simulated)
+    assert _known_physics({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
