@@ -1,0 +1,148 @@
+"""The command that has a real arm execute a lever-up."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from foretrace.cli.console import say
+from foretrace.errors import RobotError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from foretrace.robot.checks import Check
+    from foretrace.robot.path import ArmPath
+
+
+def robot(
+    base: Path,
+    contact: tuple[float, float],
+    direction: tuple[float, float],
+    out: Path = Path("execution"),
+    speed: float = 0.1,
+    clearance: float = 0.0004,
+    execute: bool = False,
+    host: str | None = None,
+    yes: bool = False,
+    timeout: float = 0.2,
+    deviation: float = 0.05,
+) -> None:
+    """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm. NEVER TRIED ON A REAL ARM.
+
+    This has only ever moved a simulated controller in foretrace's tests. Keep the emergency stop in hand.
+
+    Without --execute this is a dry run: no connection is opened. Links are checked against the table, not against
+    each other, the object or anything else.
+
+    Args:
+        base: JSON file with the calibrated pose of the arm's base in the table frame.
+        contact: Where the blade meets the object, X Y in the table frame [m].
+        direction: Along which the blade is pushed, X Y in the table frame; its length does not matter.
+        out: Folder for path.csv, checks.json and recording.csv.
+        speed: Share of the tool path's own speed, at most 1.
+        clearance: Gap between the blade's tip and the table [m].
+        execute: Move the arm.
+        host: Name or address of the controller; needed with --execute.
+        yes: Do not ask before the arm moves.
+        timeout: Longest silence of the controller before the motion is given up [s].
+        deviation: Largest angle between a joint and its path before the motion is given up [rad].
+    """
+    from foretrace.actions import LeverUp, ToolPath
+    from foretrace.robot.checks import ArmLimits, check_path, refuse_unsafe
+    from foretrace.robot.execution import WatchConfig
+    from foretrace.robot.execution import execute as move
+    from foretrace.robot.kinematics import ArmKinematics
+    from foretrace.robot.path import plan_lever_up, read_base_pose
+    from foretrace.simulation.tool import Tool
+
+    if execute and host is None:
+        raise RobotError("--execute needs --host, the controller's address")
+    watch, limits, kinematics = WatchConfig(timeout, deviation), ArmLimits(), ArmKinematics(Tool())
+    T_table_base = read_base_pose(base)
+    action, tool_path = LeverUp(contact, direction), ToolPath(clearance=clearance)
+    legs = plan_lever_up(kinematics, action, T_table_base, tool_path, speed)
+    postures = [kinematics.along(leg.joints) for leg in legs]
+    checks = [
+        check
+        for leg, along in zip(legs, postures, strict=True)
+        for check in check_path(leg, along, T_table_base, limits)
+    ]
+    _print_checks(checks)
+    out.mkdir(parents=True, exist_ok=True)
+    tips = [[T_table_base @ posture.T_base_tip for posture in along] for along in postures]
+    _write(out, legs, tips, checks)
+    refuse_unsafe(checks)
+    if not execute or host is None:
+        print("dry run: nothing was moved and no connection opened; --execute moves the arm")
+        return
+
+    def confirm(approach: "list[Check]") -> bool:
+        _print_checks(approach)
+        return yes or _agreed(host, sum(len(leg.joints) for leg in legs))
+
+    say("this has never moved a real arm: keep the emergency stop in hand; Ctrl-C stops the arm, too")
+    recording = out / "recording.csv"
+    try:
+        move(host, legs, kinematics, T_table_base, recording, limits, watch, confirm)
+    except KeyboardInterrupt:
+        say(f"interrupted; the arm was told to stop, {recording} has what was done")
+        raise
+    print(recording)
+
+
+def _agreed(host: str, num_set_points: int) -> bool:
+    """Ask whoever is at the terminal."""
+    from foretrace.simulation.arm import CONTROL_PERIOD
+
+    seconds = num_set_points * CONTROL_PERIOD
+    try:
+        answer = input(f"Move the arm at {host} for {seconds:.0f} s and its way to the start? Type yes: ")
+    except EOFError:
+        raise RobotError("nobody can confirm: run it in a terminal, or give --yes") from None
+    return answer.strip() == "yes"
+
+
+def _print_checks(checks: "list[Check]") -> None:
+    """A table for each leg."""
+    from itertools import groupby
+
+    from rich.console import Console
+    from rich.table import Table
+
+    for leg, members in groupby(checks, key=lambda check: check.leg):
+        table = Table(title=leg.capitalize(), title_justify="left", box=None, padding=(0, 1))
+        for heading in ("check", "joint", "at [s]", "worst", "limit", ""):
+            table.add_column(heading, justify="right" if heading in ("at [s]", "worst") else "left")
+        for check in members:
+            table.add_row(
+                check.name,
+                check.joint or "",
+                f"{check.time:.2f}",
+                f"{check.value:.4f}",
+                f"{'>=' if check.at_least else '<='} {check.limit:.4g} {check.unit}",
+                "ok" if check.passed else "[bold]REFUSED[/bold]",
+            )
+        Console().print(table)
+
+
+def _write(out: Path, legs: "list[ArmPath]", tips: "list[list[np.ndarray]]", checks: "list[Check]") -> None:
+    """The planned path, with the blade tip in the table frame, and its checks."""
+    import json
+    from dataclasses import asdict
+
+    import pandas as pd
+
+    from foretrace.geometry import matrix_to_pose
+    from foretrace.simulation.arm import JOINT_NAMES
+
+    rows, start = [], 0.0
+    for leg, along in zip(legs, tips, strict=True):
+        for time, joints, tip in zip(leg.times, leg.joints, along, strict=True):
+            rows.append([start + time, leg.name, *joints, *matrix_to_pose(tip)])
+        start += leg.times[-1]
+    tip_columns = [f"tip_{name}" for name in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
+    columns = ["time_s", "leg", *(f"{name}_rad" for name in JOINT_NAMES), *tip_columns]
+    pd.DataFrame(rows, columns=columns).to_csv(out / "path.csv", index=False, float_format="%.6f")
+    report = [{**asdict(check), "passed": check.passed} for check in checks]
+    (out / "checks.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    print(out / "path.csv")
+    print(out / "checks.json")

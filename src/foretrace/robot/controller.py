@@ -1,0 +1,259 @@
+"""The controller of a UR arm (CB3), through ur_rtde (`foretrace[ur]`).
+
+What ur_rtde does on its own decides how it is used here. When the connection breaks it connects again by itself, and
+with its usual flags uploads its program again: so the program is uploaded once, by hand, and never comes back after a
+stop. It reports commands as sent on a connection that is gone: so the age of the arm's data decides, not its return
+values. It cannot be interrupted while it connects, and its destructors may wait forever: so ports are tried first, and
+its objects are never destroyed.
+"""
+
+# pyright: reportMissingImports=false, reportMissingModuleSource=false
+# ur_rtde is an extra, compiled and without type stubs.
+
+import contextlib
+import ctypes
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from foretrace.errors import RobotError
+from foretrace.simulation.arm import CONTROL_PERIOD
+
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
+PATIENCE = 2.0
+"""How long an answer may take where the arm does not wait for it [s]."""
+STOP_PATIENCE = 0.5
+"""How long an answer may take while the arm is being stopped [s]."""
+STOP_DECELERATION = 2.0
+"""Deceleration of the tool when the arm is stopped [m/s^2]."""
+LOOKAHEAD, GAIN = 0.1, 300.0
+"""Smoothing of the set points [s], and stiffness, of URScript's servoj: its defaults."""
+VARIABLES = [
+    "timestamp",
+    "actual_q",
+    "actual_TCP_pose",
+    "robot_mode",
+    "safety_mode",
+    "runtime_state",
+    "safety_status_bits",
+    "speed_scaling",
+    "target_speed_fraction",
+]
+RUNNING, NORMAL, PLAYING = 7, 1, 2
+"""Robot mode, safety mode and program state in which the arm moves."""
+SAFETY_MODES = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "violation",
+    9: "fault",
+}
+ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle",
+    6: "backdrive",
+    7: "running",
+    8: "updating firmware",
+}
+
+
+@dataclass(frozen=True)
+class ArmState:
+    """What the controller last said."""
+
+    timestamp: float
+    """Time since the controller was started [s]."""
+    joints: Float[np.ndarray, "6"]
+    """Joint angles [rad]."""
+    tool_pose: Float[np.ndarray, "6"]
+    """Tool centre point as set in the controller, in the base frame: position [m], rotation vector [rad]."""
+    robot_mode: int
+    safety_mode: int
+    protective_stop: bool
+    emergency_stop: bool
+    playing: bool
+    """Whether a program runs."""
+    speed_scaling: float
+    """Share of the programmed speed that the controller allows."""
+
+    @property
+    def fault(self) -> str | None:
+        """Why the arm must not move, in words."""
+        if self.emergency_stop:
+            return "emergency stop"
+        if self.protective_stop:
+            return "protective stop"
+        if self.safety_mode != NORMAL:
+            return f"safety mode {self.safety_mode} ({SAFETY_MODES.get(self.safety_mode, 'unknown')})"
+        if self.robot_mode != RUNNING:
+            return f"robot mode {self.robot_mode} ({ROBOT_MODES.get(self.robot_mode, 'unknown')})"
+        return None
+
+
+class UrController:
+    """A connection that listens to the arm from the start, and moves it only after `take_control`.
+
+    Args:
+        host: Name or address of the controller.
+        timeout: Longest silence [s], from the controller towards us and from us towards the controller.
+
+    Raises:
+        RobotError: If ur_rtde is not installed or the controller does not answer.
+    """
+
+    def __init__(self, host: str, timeout: float) -> None:
+        try:
+            from rtde_receive import RTDEReceiveInterface
+        except ImportError as error:
+            raise RobotError("ur_rtde is not installed: run pip install 'foretrace[ur]'") from error
+        self.host, self.timeout = host, timeout
+        _greet(host)
+        self._receive = _keep(RTDEReceiveInterface(host, 1 / CONTROL_PERIOD, VARIABLES))
+        self._control: Any = None
+        self._heard, self._timestamp = time.monotonic(), -np.inf
+
+    def state(self) -> ArmState:
+        """What the controller last said."""
+        receive = self._receive
+        return ArmState(
+            timestamp=receive.getTimestamp(),
+            joints=np.array(receive.getActualQ()),
+            tool_pose=np.array(receive.getActualTCPPose()),
+            robot_mode=receive.getRobotMode(),
+            safety_mode=receive.getSafetyMode(),
+            protective_stop=receive.isProtectiveStopped(),
+            emergency_stop=receive.isEmergencyStopped(),
+            playing=receive.getRuntimeState() == PLAYING,
+            speed_scaling=receive.getSpeedScaling() * receive.getTargetSpeedFraction(),
+        )
+
+    def silence(self, state: ArmState) -> float:
+        """How long the controller has said nothing new up to a state just read [s]; infinite if it hung up."""
+        now = time.monotonic()
+        if state.timestamp != self._timestamp:
+            self._heard, self._timestamp = now, state.timestamp
+        return now - self._heard if self._receive.isConnected() else np.inf
+
+    def take_control(self) -> None:
+        """Start the program that moves the arm, and the controller's own watchdog; nothing moves yet.
+
+        Raises:
+            RobotError: If the program does not start.
+        """
+        from rtde_control import RTDEControlInterface
+
+        flags = RTDEControlInterface.FLAG_NO_WAIT  # and not FLAG_UPLOAD_SCRIPT
+        self._control = _keep(RTDEControlInterface(self.host, 1 / CONTROL_PERIOD, flags))
+        self._control.reuploadScript()
+        patience = time.monotonic() + PATIENCE
+        # Each connection hears of it at its own time.
+        while not (self.state().playing and self._control.isProgramRunning()):
+            if time.monotonic() > patience:
+                raise RobotError(
+                    f"{self.host} did not start the control program within {PATIENCE:g} s: "
+                    "look at the pendant's log, and whether a fieldbus holds the RTDE registers"
+                )
+            time.sleep(CONTROL_PERIOD)
+        if not self._control.setWatchdog(1 / self.timeout):
+            raise RobotError(
+                f"{self.host} did not take the watchdog of {self.timeout:g} s: the arm was not moved"
+            )
+
+    def send(self, joints: Float[np.ndarray, "6"]) -> None:
+        """Give the next set point [rad], and wait until the one after it is due."""
+        start = self._control.initPeriod()
+        self._control.servoJ(joints.tolist(), 0.0, 0.0, CONTROL_PERIOD, LOOKAHEAD, GAIN)
+        self._control.waitPeriod(start)
+
+    def stop(self) -> str:
+        """Stop arm and program by every way that is left; returns which one answered, in words."""
+        state = self.state()
+        heard = self.silence(state) < self.timeout
+        if self._control is None or (heard and not state.playing):
+            return "the control program does not run"
+        if heard and _within(STOP_PATIENCE, self._stop_program):
+            return "stopped"
+        if self._stop_by_dashboard():
+            return "stopped by the dashboard"
+        return f"no stop could be sent; the controller's own watchdog stops the arm after {self.timeout:g} s"
+
+    def close(self) -> None:
+        """Hang up. The arm is stopped before."""
+        ends = [each.disconnect for each in (self._control, self._receive) if each is not None]
+        threads = [threading.Thread(target=end, daemon=True) for end in ends]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(PATIENCE / 2)
+
+    def _stop_program(self) -> None:
+        self._control.servoStop(STOP_DECELERATION)
+        self._control.stopScript()
+
+    def _stop_by_dashboard(self) -> bool:
+        """Ask the dashboard server, over a connection of its own."""
+        with (
+            contextlib.suppress(OSError),
+            socket.create_connection((self.host, DASHBOARD_PORT), STOP_PATIENCE) as dashboard,
+        ):
+            dashboard.settimeout(STOP_PATIENCE)
+            dashboard.recv(1024)
+            dashboard.sendall(b"stop\n")
+            return dashboard.recv(1024).startswith(b"Stopped")
+        return False
+
+
+def _greet(host: str) -> None:
+    """See that all ports answer as a controller's would: ur_rtde would wait for one without end.
+
+    Raises:
+        RobotError: naming the port that does not.
+    """
+    port = RTDE_PORT
+    try:
+        with socket.create_connection((host, port), PATIENCE) as rtde:
+            rtde.settimeout(PATIENCE)
+            rtde.sendall(struct.pack(">HcH", 5, b"V", 2))  # may we speak version 2 of the protocol?
+            if rtde.recv(1024) != struct.pack(">HcB", 4, b"V", 1):
+                raise OSError("it does not speak RTDE version 2")
+        port = DASHBOARD_PORT
+        with socket.create_connection((host, port), PATIENCE) as dashboard:
+            dashboard.settimeout(PATIENCE)
+            if not dashboard.recv(1024):
+                raise OSError("it hung up")
+        port = SCRIPT_PORT
+        socket.create_connection((host, port), PATIENCE).close()
+    except OSError as error:
+        raise RobotError(
+            f"no UR controller answers at {host}, port {port} ({error}): check address, cable and that the arm is on"
+        ) from error
+
+
+def _keep(interface: Any) -> Any:
+    """An object of ur_rtde, kept until the process ends: its destructor waits with Python's lock held."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
+    return interface
+
+
+def _within(seconds: float, action: Callable[[], None]) -> bool:
+    """Whether an action that may hang ends within a time [s]; it goes on in the background if not."""
+    thread = threading.Thread(target=action, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()

@@ -1,0 +1,193 @@
+"""Move the arm along checked legs, watch it while it moves, and write down what it did."""
+
+import csv
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float
+
+from foretrace.errors import RobotError
+from foretrace.robot.checks import ArmLimits, Check, check_path, check_start, refuse_unsafe
+from foretrace.robot.controller import ArmState, UrController
+from foretrace.robot.kinematics import ArmKinematics
+from foretrace.robot.path import ArmPath, plan_approach
+from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
+
+LAG = 0.3
+"""The arm is compared with the set points of so long [s]: it follows them with a delay."""
+SETTLE = 0.3
+"""How long the last set point is held [s]."""
+STILL = 0.005
+"""Largest turn of a joint while somebody decides whether the arm may move [rad]."""
+FULL_SPEED = 0.99
+"""Least speed scaling of the controller; below, the arm would fall behind its set points."""
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """When a motion is given up.
+
+    Raises:
+        RobotError: If a value is out of range.
+    """
+
+    timeout: float = 0.2
+    """Longest silence of the controller, and of us towards it [s]."""
+    deviation: float = 0.05
+    """Largest angle between a joint and its set points of the last moments [rad]."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("timeout", 0.05, 2.0), ("deviation", 0.001, 0.5)):
+            if not low <= getattr(self, name) <= high:
+                raise RobotError(f"{name} = {getattr(self, name)} is outside {low:g} to {high:g}")
+
+
+class Recording:
+    """A CSV file of the motion, written as it happens.
+
+    Raises:
+        RobotError: If the file is there already.
+    """
+
+    COLUMNS = (
+        "time_s",
+        "leg",
+        *(f"{name}_rad" for name in JOINT_NAMES),
+        *(f"{name}_commanded_rad" for name in JOINT_NAMES),
+        *(f"tcp_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")),
+        "robot_mode",
+        "safety_mode",
+    )
+
+    def __init__(self, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            # Line by line: what is written stays, however the motion ends.
+            self._file = file.open("x", encoding="utf-8", newline="", buffering=1)
+        except FileExistsError as error:
+            raise RobotError(f"{file} is there already: choose another folder") from error
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow(self.COLUMNS)
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def add(self, leg: str, state: ArmState, commanded: Float[np.ndarray, "6"]) -> None:
+        """One sample."""
+        numbers = [f"{value:.6f}" for value in (*state.joints, *commanded, *state.tool_pose)]
+        self._writer.writerow([f"{state.timestamp:.4f}", leg, *numbers, state.robot_mode, state.safety_mode])
+
+
+def execute(
+    host: str,
+    legs: Sequence[ArmPath],
+    kinematics: ArmKinematics,
+    T_table_base: Float[np.ndarray, "4 4"],
+    out: Path,
+    limits: ArmLimits,
+    watch: WatchConfig,
+    confirm: Callable[[list[Check]], bool],
+) -> None:
+    """Bring the arm to the start of the first leg, and move it along all of them.
+
+    Whatever ends the motion early, Ctrl-C too, the arm is stopped and the recording keeps what was done.
+
+    Args:
+        host: Name or address of the controller.
+        legs: Checked legs, each starting where the one before ends.
+        kinematics: The arm with its screwdriver.
+        T_table_base: The arm's base in the table frame.
+        out: CSV file to record to; must not be there.
+        limits: Limits of the way to the start.
+        watch: When to give up.
+        confirm: Told the checks of the way to the start; only if it says yes does the arm move.
+
+    Raises:
+        RobotError: If the arm is not ready, its way to the start is not safe, or the motion was stopped.
+    """
+    controller = UrController(host, watch.timeout)
+    try:
+        state = controller.state()
+        _refuse_unready(state, host)
+        approach = plan_approach(state.joints, legs[0].joints[0])
+        start = check_start(approach, limits)
+        refuse_unsafe([start])
+        checks = [start, *check_path(approach, kinematics.along(approach.joints), T_table_base, limits)]
+        refuse_unsafe(checks)
+        if not confirm(checks):
+            raise RobotError("not confirmed: nothing was moved")
+        _refuse_unready(controller.state(), host)
+        if np.abs(controller.state().joints - state.joints).max() > STILL:
+            raise RobotError("the arm was moved since its way to the start was checked: start again")
+        with Recording(out) as recording:
+            _move(controller, [approach, *legs], recording, watch)
+    finally:
+        controller.close()
+
+
+def _refuse_unready(state: ArmState, host: str) -> None:
+    if state.fault:
+        raise RobotError(f"{host} is in {state.fault}: release it at the pendant first")
+    if state.playing:
+        raise RobotError(f"{host} runs a program: stop it at the pendant first")
+    if state.speed_scaling < FULL_SPEED:
+        raise RobotError(
+            f"the controller scales speeds to {100 * state.speed_scaling:.0f} %: set the slider to 100 %, "
+            "and go slower with the speed given here"
+        )
+
+
+def _move(
+    controller: UrController, legs: Sequence[ArmPath], recording: Recording, watch: WatchConfig
+) -> None:
+    """Give one set point each control period; none is ever left out, so a delay here only makes the arm wait."""
+    recent: deque[np.ndarray] = deque(maxlen=round(LAG / CONTROL_PERIOD))
+    recent.append(legs[0].joints[0])
+    hold = ArmPath("hold", np.repeat(legs[-1].joints[-1:], round(SETTLE / CONTROL_PERIOD), axis=0))
+    stopped_at = None
+    try:
+        controller.take_control()
+        for leg in [*legs, hold]:
+            for sample, set_point in enumerate(leg.joints):
+                state = controller.state()
+                recording.add(leg.name, state, recent[-1])
+                reason = _reason_to_stop(controller, state, recent, watch)
+                if reason:
+                    stopped_at = f"{reason}, {leg.name}, sample {sample} of {len(leg.joints)}"
+                    break
+                controller.send(set_point)
+                recent.append(set_point)
+            if stopped_at:
+                break
+    finally:
+        outcome = controller.stop()
+    if stopped_at:
+        raise RobotError(f"motion given up: {stopped_at}; {outcome}; the recording is kept")
+
+
+def _reason_to_stop(
+    controller: UrController, state: ArmState, recent: Sequence[np.ndarray], watch: WatchConfig
+) -> str | None:
+    """Why the motion cannot go on, in words."""
+    silence = controller.silence(state)
+    if silence > watch.timeout:
+        return "connection lost" if np.isinf(silence) else f"no data from the controller for {silence:.2f} s"
+    if state.fault:
+        return state.fault
+    if not state.playing:
+        return "the control program ended"
+    off = np.abs(np.array(recent) - state.joints)
+    nearest = off[off.max(axis=1).argmin()]
+    joint = int(nearest.argmax())
+    if nearest[joint] > watch.deviation:
+        return f"joint {JOINT_NAMES[joint]} is {nearest[joint]:.3f} rad from its path (allowed: {watch.deviation})"
+    return None

@@ -1,0 +1,140 @@
+"""The arm's joint path for one lever-up on a real table, in legs that each start and end at rest."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+from foretrace.actions import LeverUp, ToolPath
+from foretrace.errors import RobotError
+from foretrace.geometry import invert_transform, pose_to_matrix
+from foretrace.robot.kinematics import ArmKinematics
+from foretrace.simulation import arm
+from foretrace.simulation.engine import tip_transforms
+
+KNOT_PERIOD = 0.04
+"""Inverse kinematics is solved at these intervals of the unscaled path; a cubic spline joins the solutions [s]."""
+RETREAT = (-0.05, 0.10)
+"""Where the descent starts: behind and above the start of the lever-up, along the action's x and z [m]."""
+DESCENT_TIME = 2.0
+"""Time of the descent, unscaled [s]."""
+APPROACH_SPEED, APPROACH_ACCELERATION = 0.2, 0.5
+"""Largest joint speed [rad/s] and acceleration [rad/s^2] on the way to the descent, whatever the scaling."""
+FILE_FORMAT, FILE_VERSION = "foretrace-base-pose", 1
+
+
+@dataclass(frozen=True)
+class ArmPath:
+    """One leg of the way: a set point of the joints for every control period, at rest at both ends."""
+
+    name: str
+    """What it is for."""
+    joints: Float[np.ndarray, "time 6"]
+    """Joint angles [rad], `arm.CONTROL_PERIOD` apart."""
+
+    @property
+    def times(self) -> Float[np.ndarray, " time"]:
+        """Time of each set point since the leg's start [s]."""
+        return np.arange(len(self.joints)) * arm.CONTROL_PERIOD
+
+
+def read_base_pose(file: Path) -> Float[np.ndarray, "4 4"]:
+    """The calibrated pose of the arm's base in the table frame, from a JSON file.
+
+    Raises:
+        RobotError: If the file cannot be read, or is not such a pose.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RobotError(f"cannot read a base pose from {file} ({error}): give a JSON file") from error
+    found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
+    if found != (FILE_FORMAT, FILE_VERSION):
+        raise RobotError(
+            f"{file} has format {found[0]!r}, version {found[1]!r}: expected {FILE_FORMAT!r}, {FILE_VERSION}"
+        )
+    try:
+        pose = np.array(content.get("T_table_base"), dtype=float)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (7,) or not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > 1e-3:
+        raise RobotError(
+            f"{file}: T_table_base = {content.get('T_table_base')}: expected x y z [m] and a unit quaternion w x y z"
+        )
+    return pose_to_matrix(pose)
+
+
+def plan_lever_up(
+    kinematics: ArmKinematics,
+    action: LeverUp,
+    T_table_base: Float[np.ndarray, "4 4"],
+    tool_path: ToolPath,
+    speed: float,
+) -> list[ArmPath]:
+    """Descent to the start of a lever-up, and the lever-up.
+
+    Args:
+        kinematics: The arm with its screwdriver.
+        action: The lever-up, with contact and direction in the table frame: that of an object whose corners are given
+            in the table frame.
+        T_table_base: The arm's base in the table frame.
+        tool_path: The blade's path.
+        speed: Share of the tool path's own speed, over 0, at most 1.
+
+    Raises:
+        RobotError: If the speed is out of range.
+        ActionError: If the arm cannot reach a pose.
+    """
+    if not 0 < speed <= 1:
+        raise RobotError(f"speed {speed}: choose more than 0 and at most 1, the tool path's own speed")
+    T_base_action = invert_transform(T_table_base) @ invert_transform(action.T_action_object)
+    lever = tip_transforms(tool_path, _knots(tool_path.duration))
+    descent = np.repeat(lever[:1], len(_knots(DESCENT_TIME)), axis=0)
+    remaining = 1 - _minimum_jerk(len(descent))
+    descent[:, [0, 2], 3] += remaining[:, None] * np.array(RETREAT)
+    x, y = T_base_action[:2, 3]
+    # The simulated arm starts behind the contact point, facing it; the real one may look elsewhere.
+    q = np.array(arm.HOME) + np.array([np.arctan2(y, x), 0, 0, 0, 0, 0])
+    solved = []
+    for T_action_tip in np.concatenate([descent, lever]):
+        q = kinematics.solve(T_base_action @ T_action_tip, q)
+        solved.append(q)
+    split = len(descent)
+    return [
+        ArmPath("descent", _resample(np.array(solved[:split]), DESCENT_TIME / speed)),
+        ArmPath("lever-up", _resample(np.array(solved[split:]), tool_path.duration / speed)),
+    ]
+
+
+def plan_approach(start: Float[np.ndarray, "6"], goal: Float[np.ndarray, "6"]) -> ArmPath:
+    """A slow motion of all joints at once from where the arm stands.
+
+    Args:
+        start: Joint angles where it stands [rad].
+        goal: Joint angles where it shall go [rad].
+    """
+    turn = float(np.abs(goal - start).max())
+    # A minimum-jerk motion's largest speed is 15/8 of its mean, its largest acceleration 10/sqrt(3) turn / duration^2.
+    duration = max(15 / 8 * turn / APPROACH_SPEED, np.sqrt(10 / np.sqrt(3) * turn / APPROACH_ACCELERATION))
+    progress = _minimum_jerk(max(round(duration / arm.CONTROL_PERIOD), 1) + 1)
+    return ArmPath("approach", start + progress[:, None] * (goal - start))
+
+
+def _knots(duration: float) -> Float[np.ndarray, " time"]:
+    return np.linspace(0, duration, max(round(duration / KNOT_PERIOD), 3) + 1)
+
+
+def _minimum_jerk(num: int) -> Float[np.ndarray, " {num}"]:
+    """From 0 to 1 in so many samples, at rest at both ends."""
+    s = np.linspace(0, 1, num)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def _resample(knots: Float[np.ndarray, "knots 6"], duration: float) -> Float[np.ndarray, "time 6"]:
+    """A set point for every control period of a duration [s], through knots that are spread evenly over it."""
+    spline = CubicSpline(np.linspace(0, duration, len(knots)), knots, bc_type="clamped")
+    num = int(np.ceil(duration / arm.CONTROL_PERIOD)) + 1
+    return spline(np.minimum(np.arange(num) * arm.CONTROL_PERIOD, duration))

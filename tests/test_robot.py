@@ -1,0 +1,253 @@
+"""Joint paths for a real arm: they lead the blade where they should, and what is unsafe is refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from foretrace import cli
+from foretrace.actions import LeverUp, ToolPath
+from foretrace.errors import RobotError
+from foretrace.geometry import matrix_to_pose, pose_to_matrix
+from foretrace.interactions.record import Physics
+from foretrace.robot.checks import ArmLimits, check_path, check_start, refuse_unsafe
+from foretrace.robot.controller import ArmState, UrController
+from foretrace.robot.execution import WatchConfig
+from foretrace.robot.kinematics import ArmKinematics
+from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, read_base_pose
+from foretrace.simulation import arm
+from foretrace.simulation.engine import tip_transforms
+from foretrace.simulation.scene import build_scene
+from foretrace.simulation.tool import Tool
+from ur_controller import RunningController
+
+ACTION = LeverUp((0.1, 0.2), (0.6, 0.8))
+T_TABLE_BASE = pose_to_matrix(np.array([-0.4, -0.5, 0.03, np.cos(0.4), 0.0, 0.0, np.sin(0.4)]))
+GOOD = np.array([2.9, -1.2, 2.3, -3.0, -1.5, 1.3])
+
+
+@pytest.fixture(scope="module")
+def kinematics() -> ArmKinematics:
+    return ArmKinematics(Tool())
+
+
+@pytest.fixture(scope="module")
+def legs(kinematics) -> list[ArmPath]:
+    return plan_lever_up(kinematics, ACTION, T_TABLE_BASE, ToolPath(), 0.5)
+
+
+@pytest.fixture
+def base_file(tmp_path) -> Path:
+    file = tmp_path / "base.json"
+    pose = matrix_to_pose(T_TABLE_BASE).tolist()
+    file.write_text(json.dumps({"format": "foretrace-base-pose", "version": 1, "T_table_base": pose}))
+    return file
+
+
+def still(*joints: float) -> ArmPath:
+    return ArmPath("test", np.tile(joints, (3, 1)))
+
+
+def failures(path: ArmPath, kinematics: ArmKinematics, **limits: float) -> dict[str, str]:
+    """Message of every check that fails, by the check's name."""
+    found = {}
+    for check in check_path(path, kinematics.along(path.joints), np.eye(4), ArmLimits(**limits)):
+        if not check.passed:
+            with pytest.raises(RobotError) as error:
+                refuse_unsafe([check])
+            found[check.name] = str(error.value)
+    return found
+
+
+def test_the_blade_follows_the_tool_path_on_the_table(legs):
+    """With another library's forward kinematics, on a base that is turned, shifted and raised."""
+    ur = pytest.importorskip("ur_analytic_ik")
+    times = np.minimum(0.5 * legs[1].times, ToolPath().duration)
+    wanted = np.linalg.inv(ACTION.T_action_object) @ tip_transforms(ToolPath(), times)
+    flanges = np.array([ur.ur10.forward_kinematics(*q) for q in legs[1].joints])
+    tips = T_TABLE_BASE @ flanges @ arm.T_flange_tip(Tool())
+    np.testing.assert_allclose(tips, wanted, atol=2e-5)
+
+
+def test_legs_join_and_rest_at_their_ends(legs):
+    np.testing.assert_allclose(legs[0].joints[-1], legs[1].joints[0], atol=1e-12)
+    for leg in [plan_approach(GOOD, legs[0].joints[0]), *legs]:
+        speeds = np.diff(leg.joints, axis=0) / arm.CONTROL_PERIOD
+        assert np.abs(speeds[[0, -1]]).max() < 0.01
+
+
+def test_speed_scales_time_alone(kinematics, legs):
+    slow = plan_lever_up(kinematics, ACTION, T_TABLE_BASE, ToolPath(), 0.1)
+    for fast_leg, slow_leg in zip(legs, slow, strict=True):
+        same = slow_leg.joints[::5][: len(fast_leg.joints)]
+        np.testing.assert_allclose(fast_leg.joints[: len(same)], same, atol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [0, 225])
+def test_a_usual_lever_up_passes_all_checks(kinematics, degrees):
+    direction = (np.cos(np.radians(degrees)), np.sin(np.radians(degrees)))
+    legs = plan_lever_up(kinematics, LeverUp((0.75, 0.1), direction), np.eye(4), ToolPath(), 1.0)
+    for leg in legs:
+        assert failures(leg, kinematics) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "said"),
+    [
+        ("joint angle", still(*GOOD[:5], 6.25), "of wrist_3 is 6.25 rad at sample 0"),
+        ("flange from base", still(0, -1.0, 0.3, 0.5, 1.5, 0), "at most 1.1"),
+        ("flange from base axis", still(0, -1.9, 2.4, 0.5, 1.5, 0), "at least 0.35"),
+        ("elbow singularity", still(0, -1.0, 0.1, 0.5, 1.5, 0), "is 0.09983 sine"),
+        ("wrist singularity", still(*GOOD[:4], -0.1, 0), "is 0.09983 sine"),
+        ("shoulder singularity", still(0, -2.2, 1.5, 0.5, 1.5, 0), "at least 0.15"),
+        ("least singular value", still(*GOOD[:4], 0.0, 0), "at least 0.05"),
+        ("arm above table", still(0, -0.2, 0.4, 0.0, 1.5, 0), "at least 0.01"),
+        ("blade above table", still(0, -0.2, 0.4, 0.0, 1.5, 0), "at least 0"),
+    ],
+)
+def test_each_unsafe_posture_is_refused(kinematics, name, path, said):
+    assert said in failures(path, kinematics)[name]
+
+
+def test_jumps_are_refused(kinematics):
+    path = still(*GOOD)
+    path.joints[1:, 2] += 0.02
+    found = failures(path, kinematics)
+    assert "of elbow is 2.5 rad/s at sample 0 (0.00 s), the limit is at most 1.571" in found["joint speed"]
+    assert "of elbow is 312.5 rad/s2" in found["joint acceleration"]
+    assert "m/s at sample 0" in found["blade tip speed"]
+
+
+def test_numbers_that_are_not_finite_are_refused(kinematics):
+    path = still(*GOOD)
+    path.joints[1, 4] = np.nan
+    with pytest.raises(RobotError, match="wrist_2 is not finite at sample 1"):
+        check_path(path, kinematics.along(path.joints), np.eye(4), ArmLimits())
+
+
+def test_a_base_that_is_lower_than_calibrated_puts_the_blade_into_the_table(kinematics, legs):
+    lower = T_TABLE_BASE.copy()
+    lower[2, 3] -= 0.001
+    with pytest.raises(RobotError, match=r"descent: blade above table is -0\.0006 m"):
+        refuse_unsafe(check_path(legs[0], kinematics.along(legs[0].joints), lower, ArmLimits()))
+
+
+def test_clearance_agrees_with_the_collision_checker(kinematics):
+    model = build_scene(None, Physics(), Tool(), "arm", 0.002).compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = GOOD
+    mujoco.mj_kinematics(model, data)
+    table, geoms = model.geom("table").id, range(3, model.ngeom)
+    gaps = {model.geom(g).name: mujoco.mj_geomDistance(model, data, table, g, 1.0, None) for g in geoms}
+    blade = gaps.pop("blade")
+    unnamed = [
+        mujoco.mj_geomDistance(model, data, table, g, 1.0, None) for g in geoms if not model.geom(g).name
+    ]
+    path = still(*GOOD)
+    found = check_path(path, kinematics.along(path.joints), np.eye(4), ArmLimits())
+    checks = {check.name: check.value for check in found}
+    assert checks["blade above table"] == pytest.approx(blade, abs=1e-6)
+    assert checks["arm above table"] == pytest.approx(min([*unnamed, *gaps.values()]), abs=1e-6)
+
+
+def test_a_start_far_away_is_refused():
+    check = check_start(plan_approach(GOOD + np.array([0, 0, 0, 2.0, 0, 0]), GOOD), ArmLimits())
+    with pytest.raises(RobotError, match=r"way to the start of wrist_1 is 2 rad at sample 0"):
+        refuse_unsafe([check])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{", "cannot read a base pose"),
+        ("[]", "has format None"),
+        ('{"format": "foretrace-base-pose", "version": 2}', "version 2"),
+        ('{"format": "foretrace-base-pose", "version": 1}', "T_table_base = None"),
+        (
+            '{"format": "foretrace-base-pose", "version": 1, "T_table_base": [0, 0, 0, 1, 1, 0, 0]}',
+            "unit quaternion",
+        ),
+        (
+            '{"format": "foretrace-base-pose", "version": 1, "T_table_base": [0, 0, "x", 1, 0, 0, 0]}',
+            "unit quaternion",
+        ),
+    ],
+)
+def test_a_wrong_base_pose_is_refused(tmp_path, text, said):
+    file = tmp_path / "base.json"
+    file.write_text(text)
+    with pytest.raises(RobotError, match=said):
+        read_base_pose(file)
+
+
+def test_a_base_pose_is_read(base_file):
+    np.testing.assert_allclose(read_base_pose(base_file), T_TABLE_BASE, atol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [0.0, -0.1, 1.1, np.nan])
+def test_a_wrong_speed_is_refused(kinematics, speed):
+    with pytest.raises(RobotError, match="choose more than 0 and at most 1"):
+        plan_lever_up(kinematics, ACTION, T_TABLE_BASE, ToolPath(), speed)
+
+
+def test_wrong_watch_settings_are_refused():
+    with pytest.raises(RobotError, match=r"timeout = 10.0 is outside 0\.05 to 2"):
+        WatchConfig(timeout=10.0)
+    with pytest.raises(RobotError, match="deviation = nan"):
+        WatchConfig(deviation=np.nan)
+
+
+def test_faults_are_named():
+    good = ArmState(0.0, GOOD, np.zeros(6), 7, 1, False, False, True, 1.0)
+    assert good.fault is None
+    assert replace(good, robot_mode=5).fault == "robot mode 5 (idle)"
+    assert replace(good, safety_mode=5).fault == "safety mode 5 (safeguard stop)"
+    assert replace(good, safety_mode=3, protective_stop=True).fault == "protective stop"
+    assert replace(good, safety_mode=7, emergency_stop=True).fault == "emergency stop"
+
+
+def command(base: Path, out: Path, *more: str) -> list[str]:
+    place = ["--contact", "0.1", "0.2", "--direction", "0.6", "0.8"]
+    return ["robot", "--base", str(base), *place, "--out", str(out), *more]
+
+
+def test_a_dry_run_opens_no_connection(base_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(UrController, "__init__", lambda *_: pytest.fail("a connection was opened"))
+    with RunningController(GOOD) as controller:
+        assert cli.main(command(base_file, tmp_path, "--host", controller.host, "--speed", "1")) == 0
+    assert controller.facts.connections == 0
+    printed = capsys.readouterr().out
+    assert "dry run" in printed
+    assert "REFUSED" not in printed
+    rows = (tmp_path / "path.csv").read_text().splitlines()
+    assert rows[0].startswith("time_s,leg,shoulder_pan_rad")
+    assert len(rows) == 1 + 251 + 370
+    assert all(check["passed"] for check in json.loads((tmp_path / "checks.json").read_text()))
+
+
+def test_a_refused_path_opens_no_connection(base_file, tmp_path, capsys):
+    with RunningController(GOOD) as controller:
+        options = ["--host", controller.host, "--execute", "--yes", "--speed", "1"]
+        pose = json.loads(base_file.read_text())
+        pose["T_table_base"][:2] = [-0.6, -0.9]
+        base_file.write_text(json.dumps(pose))
+        assert cli.main(command(base_file, tmp_path, *options)) == 2
+    assert controller.facts.connections == 0
+    captured = capsys.readouterr()
+    assert "REFUSED" in captured.out
+    assert captured.err.startswith("foretrace: error: descent: flange from base is 1.102 m at sample 250")
+    assert len(captured.err.splitlines()) == 1
+
+
+def test_executing_needs_a_host(base_file, tmp_path, capsys):
+    assert cli.main(command(base_file, tmp_path, "--execute")) == 2
+    assert "--execute needs --host" in capsys.readouterr().err
+
+
+def test_help_says_that_no_arm_was_moved(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["robot", "--help"])
+    assert "NEVER TRIED ON A REAL ARM" in " ".join(capsys.readouterr().out.split())
