@@ -22,6 +22,7 @@ from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
 from foretrace.cli.figures import figures
 from foretrace.cli.learning import predict, train
 from foretrace.cli.non_flat import evaluate_non_flat
+from foretrace.cli.randomisation import evaluate_randomisation
 from foretrace.cli.reconstruction import evaluate_reconstruction
 from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.transfer import evaluate_transfer
@@ -49,6 +50,7 @@ COMMANDS: dict[str, Command | Group] = {
         {
             "predictor": evaluate_predictor,
             "paper": evaluate_paper,
+            "randomisation": evaluate_randomisation,
             "reconstruction": evaluate_reconstruction,
             "replay": evaluate_replay,
             "transfer": evaluate_transfer,
