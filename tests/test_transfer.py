@@ -16,7 +16,7 @@ from foretrace.cli import main
 from foretrace.errors import PredictionError, ShapeError, SimulationError, ViewError
 from foretrace.evaluation import transfer_objects
 from foretrace.evaluation.stand_in import Observation, Perturbation, StandIn, hull_of
-from foretrace.evaluation.transfer import distance_until_slip, evaluate_transfer
+from foretrace.evaluation.transfer import distance_until_slip, evaluate_transfer, own_error
 from foretrace.evaluation.transfer_objects import (
     HEPTAGON,
     PENTAGON,
@@ -28,7 +28,7 @@ from foretrace.evaluation.transfer_objects import (
     read_prisms,
     read_silhouettes,
 )
-from foretrace.evaluation.transfer_report import PAPER_PREDICTED, bar_lines, markdown, summarise
+from foretrace.evaluation.transfer_report import DISTANCES, PAPER_PREDICTED, bar_lines, markdown, summarise
 from foretrace.geometry import convex_hull, transform_points
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
@@ -54,7 +54,7 @@ def observe(stand_in: StandIn, seed: int) -> Observation:
 
 @pytest.fixture
 def predictor():
-    made = TrainConfig("none", hidden=8).make_predictor(60)
+    made = TrainConfig(features="none", hidden=8).make_predictor(60)
     made.times.copy_(0.05 * torch.arange(60))
     return made
 
@@ -77,6 +77,8 @@ def test_without_differences_the_stand_in_is_the_simulator(predictor) -> None:
     found = evaluate_transfer(predictor, [PENTAGON_EDGE], StandIn.undisturbed(), repeats=1)
     assert found.rows["distance_simulated_cm"].to_list() == pytest.approx([0.0], abs=1e-9)
     assert found.rows["distance_predicted_cm"].to_list()[0] > 0.1
+    own, predicted = (found.rows[f"distance_{name}_cm"] for name in ("simulated_predicted", "predicted"))
+    assert own.to_list() == pytest.approx(predicted.to_list())
     np.testing.assert_array_equal(found.examples[0].view.mask, found.examples[0].simulated.view.mask)
 
 
@@ -175,9 +177,19 @@ def test_the_predictor_sees_the_hull_where_it_should(predictor, monkeypatch, hul
     evaluate_transfer(predictor, [subject], StandIn.undisturbed("mujoco", "tool"), repeats=1)
     exact = TopDownView.of(L_SHAPE, action)
     expected = hull_of(exact) if hull else exact
-    assert len(seen) == 2
+    assert len(seen) == 3
     for view in seen:
         np.testing.assert_array_equal(view.mask, expected.mask)
+
+
+def test_what_the_simulator_says_is_no_error(predictor, monkeypatch) -> None:
+    simulated = play(PENTAGON_EDGE, 0, NOISY, 1, 0).simulated
+    path = simulated.effect.com_trajectory
+    seen = ImaginedEffect(simulated.effect.times, path + np.array([0, 0, 0.01]))
+    monkeypatch.setattr(predictor, "imagine", lambda view, com, known: seen)
+    assert own_error(predictor, simulated.view, simulated) == pytest.approx(1.0, abs=0.2)
+    monkeypatch.setattr(predictor, "imagine", lambda view, com, known: simulated.effect)
+    assert own_error(predictor, simulated.view, simulated) == 0
 
 
 def test_paths_are_compared_up_to_the_slip() -> None:
@@ -289,7 +301,7 @@ def test_bad_prisms_are_named(tmp_path, content, message) -> None:
 
 def table_of(means: dict[str, list[float]], outcome: str = "levered") -> pd.DataFrame:
     """Two repetitions, 0.1 cm above and below each mean."""
-    names = ("distance_simulated_cm", "distance_predicted_cm", "distance_predicted_from_view_cm")
+    names = DISTANCES.values()
     return pd.DataFrame(
         [
             {"object": name, "group": "printed", "contact": edge, "repetition": k, "outcome": outcome}
@@ -425,7 +437,7 @@ def test_a_run_that_is_not_there_is_one_line(tmp_path, capsys) -> None:
 
 
 def test_oracles_are_refused() -> None:
-    oracle = TrainConfig("sp-truth", hidden=8).make_predictor(60)
+    oracle = TrainConfig(features="sp-truth", hidden=8).make_predictor(60)
     with pytest.raises(PredictionError, match="observed during the action"):
         evaluate_transfer(oracle, [PENTAGON_EDGE], NOISY)
 

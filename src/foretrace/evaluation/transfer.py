@@ -100,10 +100,13 @@ def evaluate_transfer(
     examples: list[Example] = []
     all_played = _play_all(contacts, stand_in, repeats, seed, workers)
     for (subject, contact), played in _reported(contacts, all_played, console or Console(stderr=True)):
+        exact = played.simulated.view
+        own = own_error(predictor, hull_of(exact) if subject.hull else exact, played.simulated)
         for repetition, observed in enumerate(played.observed):
             view = hull_of(observed.view) if subject.hull else observed.view
             row, imagined = compare(predictor, view, observed, played.simulated)
             place = {"object": subject.name, "group": subject.group, "contact": contact + 1}
+            row["distance_simulated_predicted_cm"] = own
             rows.append({**place, "repetition": repetition, **row, **asdict(observed.perturbation)})
             if repetition == 0:
                 examples.append(Example(subject, contact, view, played.simulated, observed, imagined))
@@ -158,6 +161,20 @@ def compare(
             observed, effect.times, effect.com_trajectory, slipped_at
         )
     return row, imagined
+
+
+def own_error(predictor: EffectPredictor, view: TopDownView, simulated: Interaction) -> float:
+    """Distance of the imagined path from the simulator's, of which everything is told [cm]; NaN if that diverged.
+
+    What is left of a prediction's error where nothing differs: it has not been learned better.
+    """
+    effect = simulated.effect
+    if len(effect.times) == 0:
+        return np.nan
+    known = {name: getattr(simulated.physics, name) for name in predictor.known}
+    imagined = predictor.imagine(view, effect.com_trajectory[0], known).com_trajectory
+    end = slice(None) if effect.slip_index is None else slice(max(1, effect.slip_index))
+    return CM * warped_distance(effect.com_trajectory[end], imagined[end]).distance
 
 
 def distance_until_slip(

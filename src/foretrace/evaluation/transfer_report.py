@@ -28,6 +28,7 @@ DISTANCES = {
     "simulated": "distance_simulated_cm",
     "predicted": "distance_predicted_cm",
     "predicted_from_view": "distance_predicted_from_view_cm",
+    "simulated_predicted": "distance_simulated_predicted_cm",
 }
 STATISTICS = {"mean": "mean", "sd": "standard deviation", "max": "largest"}
 NOTE = (
@@ -166,6 +167,8 @@ def _table(heads: Sequence[str], entries: Sequence[Mapping[str, Any]], kinds: It
         ]
     blind = [_number(entry["predicted_from_view"]["mean"]) for entry in entries]
     lines.append(["Stand-in vs predicted from the view alone, mean", *blind])
+    own = [_number(entry["simulated_predicted"]["mean"]) for entry in entries]
+    lines.append(["Simulation vs predicted, told everything", *own])
     lines.append(["Not levered", *(_others(entry["outcomes"]) for entry in entries)])
     return _rows(lines)
 
