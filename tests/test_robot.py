@@ -15,7 +15,7 @@ from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.record import Physics
 from foretrace.robot.checks import ArmLimits, check_path, check_start, refuse_unsafe
 from foretrace.robot.controller import ArmState, UrController
-from foretrace.robot.execution import WatchConfig
+from foretrace.robot.execution import WatchConfig, refuse_unready
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, read_base_pose
 from foretrace.simulation import arm
@@ -207,6 +207,11 @@ def test_faults_are_named():
     assert replace(good, safety_mode=5).fault == "safety mode 5 (safeguard stop)"
     assert replace(good, safety_mode=3, protective_stop=True).fault == "protective stop"
     assert replace(good, safety_mode=7, emergency_stop=True).fault == "emergency stop"
+    refuse_unready(replace(good, playing=False), "arm")
+    with pytest.raises(RobotError, match="arm is in protective stop: release it"):
+        refuse_unready(replace(good, protective_stop=True), "arm")
+    with pytest.raises(RobotError, match="arm runs a program: stop it"):
+        refuse_unready(good, "arm")
 
 
 def command(base: Path, out: Path, *more: str) -> list[str]:

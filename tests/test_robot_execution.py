@@ -2,14 +2,18 @@
 
 import csv
 import sys
+import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from foretrace.errors import RobotError
+from foretrace.interactions.film_folder import FilmNotes
 from foretrace.robot.checks import ArmLimits
-from foretrace.robot.execution import SETTLE, WatchConfig, execute
+from foretrace.robot.execution import SETTLE, Recording, WatchConfig, execute
+from foretrace.robot.filming import Filming
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath
 from foretrace.simulation.arm import CONTROL_PERIOD
@@ -21,11 +25,11 @@ if sys.platform != "linux":
     pytest.skip("only Linux has more than one loopback address", allow_module_level=True)
 
 START = np.array([2.9, -1.5, 2.3, -3.0, -1.5, 1.3])
-NUM = 80
-LEG = ArmPath("lever-up", START + np.linspace(0, 0.15, NUM)[:, None] * np.array([1, 0, 0, -1, 0, 0]))
+NUM = 60
+LEG = ArmPath("lever-up", START + np.linspace(0, 0.12, NUM)[:, None] * np.array([1, 0, 0, -1, 0, 0]))
 WATCH = WatchConfig(timeout=0.5)
 """Longer than the default: the tests' machine may be busy."""
-HALF = 40
+HALF = 30
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +42,8 @@ def recording(tmp_path) -> Path:
     return tmp_path / "recording.csv"
 
 
-def go(host: str, kinematics: ArmKinematics, recording: Path, confirm=lambda checks: True) -> None:
-    execute(host, [LEG], kinematics, np.eye(4), recording, ArmLimits(), WATCH, confirm)
+def go(host: str, kinematics: ArmKinematics, recording: Path, confirm=lambda checks: True, film=None) -> None:
+    execute(host, [LEG], kinematics, np.eye(4), recording, ArmLimits(), WATCH, confirm, film)
 
 
 def read(recording: Path) -> list[dict[str, str]]:
@@ -67,6 +71,58 @@ def test_a_lever_up_is_executed(kinematics, recording):
     last = [float(rows[-1][name]) for name in rows[-1] if name.endswith(("pan_rad", "wrist_1_rad"))]
     np.testing.assert_allclose(last, LEG.joints[-1, [0, 3]], atol=1e-3)
     assert {(row["robot_mode"], row["safety_mode"]) for row in rows} == {("7", "1")}
+
+
+class PacedCamera:
+    """A video file that gives its pictures at the pace of a camera, over and over."""
+
+    def __init__(self, file: Path) -> None:
+        self._picture = cv2.VideoCapture(str(file)).read()[1]
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        time.sleep(1 / 30)
+        return True, self._picture
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def video(tmp_path) -> Path:
+    file = tmp_path / "camera.avi"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 48))
+    writer.write(np.full((48, 64, 3), 90, np.uint8))
+    writer.write(np.full((48, 64, 3), 200, np.uint8))
+    writer.release()
+    return file
+
+
+def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording, video, monkeypatch):
+    folder = recording.parent / "film"
+    film = Filming(str(video), folder)
+    monkeypatch.setattr(film, "_capture", PacedCamera(video))
+    with RunningController(START) as controller:
+        go(controller.host, kinematics, recording, film=film)
+    with (folder / "timestamps.csv").open(newline="") as file:
+        frames = list(csv.DictReader(file))
+    times, rows = [float(frame["time_s"]) for frame in frames], read(recording)
+    assert np.all(np.diff(times) > 0)
+    assert times[0] < float(rows[0]["host_s"])
+    assert times[-1] > float(rows[-1]["host_s"])
+    assert all((folder / frame["colour"]).is_file() for frame in frames)
+    lever_up = next(float(row["host_s"]) for row in rows if row["leg"] == "lever-up")
+    assert FilmNotes.load(folder).action_start == pytest.approx(lever_up, abs=0.05)
+
+
+def test_a_camera_that_ends_early_is_told(video, tmp_path):
+    with pytest.warns(UserWarning, match="no more pictures"), Filming(str(video), tmp_path / "film"):
+        time.sleep(0.2)
+    assert len((tmp_path / "film" / "timestamps.csv").read_text().splitlines()) == 2
+
+
+def test_a_camera_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RobotError, match=r"camera \S+none\.avi gives no picture"):
+        Filming(str(tmp_path / "none.avi"), tmp_path / "film")
 
 
 @pytest.mark.parametrize(
@@ -97,16 +153,9 @@ def test_ctrl_c_stops_the_arm_and_keeps_the_recording(kinematics, recording):
     assert len(read(recording)) >= HALF
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"safety_mode": 3}, "is in protective stop: release it"),
-        ({"speed_slider": 0.5}, "scales speeds to 50 %"),
-        ({"playing": True}, "runs a program"),
-    ],
-)
-def test_an_arm_that_is_not_ready_is_left_alone(kinematics, recording, settings, said):
-    with RunningController(START, **settings) as controller, pytest.raises(RobotError, match=said):
+def test_an_arm_that_is_not_ready_is_left_alone(kinematics, recording):
+    said = "scales speeds to 50 %"
+    with RunningController(START, speed_slider=0.5) as controller, pytest.raises(RobotError, match=said):
         go(controller.host, kinematics, recording)
     assert (controller.facts.uploads, controller.facts.set_points) == (0, [])
     assert not recording.exists()
@@ -131,9 +180,8 @@ def test_a_controller_that_is_not_there_is_named(kinematics, recording):
         go("127.0.0.1", kinematics, recording)
 
 
-def test_an_older_recording_is_not_overwritten(kinematics, recording):
+def test_an_older_recording_is_not_overwritten(recording):
     recording.write_text("mine")
-    with RunningController(START) as controller, pytest.raises(RobotError, match="is there already"):
-        go(controller.host, kinematics, recording)
+    with pytest.raises(RobotError, match="is there already"):
+        Recording(recording)
     assert recording.read_text() == "mine"
-    assert controller.facts.uploads == 0

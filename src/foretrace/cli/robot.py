@@ -25,6 +25,7 @@ def robot(
     yes: bool = False,
     timeout: float = 0.2,
     deviation: float = 0.05,
+    camera: str | None = None,
 ) -> None:
     """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm. NEVER TRIED ON A REAL ARM.
 
@@ -37,7 +38,7 @@ def robot(
         base: JSON file with the calibrated pose of the arm's base in the table frame.
         contact: Where the blade meets the object, X Y in the table frame [m].
         direction: Along which the blade is pushed, X Y in the table frame; its length does not matter.
-        out: Folder for path.csv, checks.json and recording.csv.
+        out: Folder for path.csv, checks.json, recording.csv and film.
         speed: Share of the tool path's own speed, at most 1.
         clearance: Gap between the blade's tip and the table [m].
         execute: Move the arm.
@@ -45,11 +46,13 @@ def robot(
         yes: Do not ask before the arm moves.
         timeout: Longest silence of the controller before the motion is given up [s].
         deviation: Largest angle between a joint and its path before the motion is given up [rad].
+        camera: Film the motion into the folder's film: number of a camera, or what else OpenCV opens.
     """
     from foretrace.actions import LeverUp, ToolPath
     from foretrace.robot.checks import ArmLimits, check_path, refuse_unsafe
     from foretrace.robot.execution import WatchConfig
     from foretrace.robot.execution import execute as move
+    from foretrace.robot.filming import Filming
     from foretrace.robot.kinematics import ArmKinematics
     from foretrace.robot.path import plan_lever_up, read_base_pose
     from foretrace.simulation.tool import Tool
@@ -82,9 +85,15 @@ def robot(
     say("this has never moved a real arm: keep the emergency stop in hand; Ctrl-C stops the arm, too")
     recording = out / "recording.csv"
     try:
-        move(host, legs, kinematics, T_table_base, recording, limits, watch, confirm)
+        film = None if camera is None else Filming(camera, out / "film")
+        move(host, legs, kinematics, T_table_base, recording, limits, watch, confirm, film)
     except KeyboardInterrupt:
-        say(f"interrupted; the arm was told to stop, {recording} has what was done")
+        done = (
+            f"the arm was told to stop, {recording} has what was done"
+            if recording.exists()
+            else "nothing moved"
+        )
+        say(f"interrupted; {done}")
         raise
     print(recording)
 

@@ -199,8 +199,9 @@ class UrController:
         threads = [threading.Thread(target=end, daemon=True) for end in ends]
         for thread in threads:
             thread.start()
+        deadline = time.monotonic() + PATIENCE / 2
         for thread in threads:
-            thread.join(PATIENCE / 2)
+            thread.join(max(0.0, deadline - time.monotonic()))
 
     def _stop_program(self) -> None:
         self._control.servoStop(STOP_DECELERATION)

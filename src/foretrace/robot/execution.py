@@ -1,8 +1,10 @@
 """Move the arm along checked legs, watch it while it moves, and write down what it did."""
 
 import csv
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +15,7 @@ from jaxtyping import Float
 from foretrace.errors import RobotError
 from foretrace.robot.checks import ArmLimits, Check, check_path, check_start, refuse_unsafe
 from foretrace.robot.controller import ArmState, UrController
+from foretrace.robot.filming import Filming
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath, plan_approach
 from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
@@ -55,6 +58,7 @@ class Recording:
 
     COLUMNS = (
         "time_s",
+        "host_s",
         "leg",
         *(f"{name}_rad" for name in JOINT_NAMES),
         *(f"{name}_commanded_rad" for name in JOINT_NAMES),
@@ -84,7 +88,8 @@ class Recording:
     def add(self, leg: str, state: ArmState, commanded: Float[np.ndarray, "6"]) -> None:
         """One sample."""
         numbers = [f"{value:.6f}" for value in (*state.joints, *commanded, *state.tool_pose)]
-        self._writer.writerow([f"{state.timestamp:.4f}", leg, *numbers, state.robot_mode, state.safety_mode])
+        times = [f"{state.timestamp:.4f}", f"{time.monotonic():.4f}"]
+        self._writer.writerow([*times, leg, *numbers, state.robot_mode, state.safety_mode])
 
 
 def execute(
@@ -96,6 +101,7 @@ def execute(
     limits: ArmLimits,
     watch: WatchConfig,
     confirm: Callable[[list[Check]], bool],
+    film: Filming | None = None,
 ) -> None:
     """Bring the arm to the start of the first leg, and move it along all of them.
 
@@ -110,6 +116,7 @@ def execute(
         limits: Limits of the way to the start.
         watch: When to give up.
         confirm: Told the checks of the way to the start; only if it says yes does the arm move.
+        film: A camera to film the motion with.
 
     Raises:
         RobotError: If the arm is not ready, its way to the start is not safe, or the motion was stopped.
@@ -117,7 +124,7 @@ def execute(
     controller = UrController(host, watch.timeout)
     try:
         state = controller.state()
-        _refuse_unready(state, host)
+        refuse_unready(state, host)
         approach = plan_approach(state.joints, legs[0].joints[0])
         start = check_start(approach, limits)
         refuse_unsafe([start])
@@ -125,16 +132,21 @@ def execute(
         refuse_unsafe(checks)
         if not confirm(checks):
             raise RobotError("not confirmed: nothing was moved")
-        _refuse_unready(controller.state(), host)
+        refuse_unready(controller.state(), host)
         if np.abs(controller.state().joints - state.joints).max() > STILL:
             raise RobotError("the arm was moved since its way to the start was checked: start again")
-        with Recording(out) as recording:
-            _move(controller, [approach, *legs], recording, watch)
+        with Recording(out) as recording, film or nullcontext():
+            _move(controller, [approach, *legs], recording, watch, film)
     finally:
         controller.close()
 
 
-def _refuse_unready(state: ArmState, host: str) -> None:
+def refuse_unready(state: ArmState, host: str) -> None:
+    """Refuse an arm that cannot follow set points now.
+
+    Raises:
+        RobotError: saying why, and what to do at the pendant.
+    """
     if state.fault:
         raise RobotError(f"{host} is in {state.fault}: release it at the pendant first")
     if state.playing:
@@ -147,7 +159,11 @@ def _refuse_unready(state: ArmState, host: str) -> None:
 
 
 def _move(
-    controller: UrController, legs: Sequence[ArmPath], recording: Recording, watch: WatchConfig
+    controller: UrController,
+    legs: Sequence[ArmPath],
+    recording: Recording,
+    watch: WatchConfig,
+    film: Filming | None,
 ) -> None:
     """Give one set point each control period; none is ever left out, so a delay here only makes the arm wait."""
     recent: deque[np.ndarray] = deque(maxlen=round(LAG / CONTROL_PERIOD))
@@ -157,6 +173,8 @@ def _move(
     try:
         controller.take_control()
         for leg in [*legs, hold]:
+            if film is not None and leg is legs[-1]:
+                film.action_start = time.monotonic()
             for sample, set_point in enumerate(leg.joints):
                 state = controller.state()
                 recording.add(leg.name, state, recent[-1])

@@ -1,0 +1,72 @@
+"""Film a motion while it happens, into the folder format that `interactions.film_folder` defines."""
+
+import json
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+
+from foretrace.errors import RobotError
+from foretrace.interactions.film_folder import DEPTH_UNIT, NOTES, FilmNotes, Frame, write_film
+
+PATIENCE = 5.0
+"""How long the first and the last frame may take [s]."""
+
+
+class Filming:
+    """A camera that films between the beginning and the end of a ``with`` block, beside everything else.
+
+    Args:
+        source: Number of a camera, or whatever else OpenCV opens: a device, a stream's address, a video file.
+        folder: An empty or new folder for the frames.
+
+    Raises:
+        RobotError: If the camera gives no picture, or the folder is in use.
+    """
+
+    def __init__(self, source: str, folder: Path) -> None:
+        if folder.exists() and any(folder.iterdir()):
+            raise RobotError(f"{folder} is in use: choose another folder")
+        self._capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+        if not self._capture.grab():
+            raise RobotError(
+                f"camera {source} gives no picture: choose a number, a device or a file that OpenCV opens"
+            )
+        self._folder, self._first, self._finish = folder, threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._film, daemon=True)
+        self.action_start: float | None = None
+        """When the blade's path started, by this machine's monotonic clock [s]."""
+
+    def __enter__(self) -> "Filming":
+        self._thread.start()
+        self._first.wait(PATIENCE)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._thread.is_alive():
+            warnings.warn(
+                f"the camera gave no more pictures before the motion was over: {self._folder}", stacklevel=2
+            )
+        self._finish.set()
+        self._thread.join(PATIENCE)
+        self._capture.release()
+        notes = {"depth_unit": DEPTH_UNIT, "action_start": self.action_start}
+        (self._folder / NOTES).write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+
+    def _film(self) -> None:
+        write_film(self._folder, self._frames(), FilmNotes())
+
+    def _frames(self) -> Iterator[Frame]:
+        """Frames as they come, stamped with this machine's monotonic clock."""
+        while not self._finish.is_set():
+            seen, picture = self._capture.read()
+            if not seen:
+                return
+            yield Frame(time.monotonic(), picture)
+            self._first.set()
