@@ -252,6 +252,28 @@ def test_executing_needs_a_host(base_file, tmp_path, capsys):
     assert "--execute needs --host" in capsys.readouterr().err
 
 
+def test_nothing_moves_before_somebody_says_yes(base_file, tmp_path, capsys, monkeypatch):
+    answers, given = iter(["yes", "y", "", EOFError()]), []
+
+    def answer(_question):
+        if isinstance(reply := next(answers), str):
+            return reply
+        raise reply
+
+    def fake_execute(host, legs, kinematics, T_table_base, out, limits, watch, confirm, film):
+        assert (host, out, film, watch.timeout) == ("arm", tmp_path / "recording.csv", None, 0.3)
+        assert [leg.name for leg in legs] == ["descent", "lever-up"]
+        given.extend(confirm([]) for _ in range(3))
+        confirm([])
+
+    monkeypatch.setattr("builtins.input", answer)
+    monkeypatch.setattr("foretrace.robot.execution.execute", fake_execute)
+    options = ["--execute", "--host", "arm", "--speed", "1", "--timeout", "0.3"]
+    assert cli.main(command(base_file, tmp_path, *options)) == 2
+    assert given == [True, False, False]
+    assert "nobody can confirm" in capsys.readouterr().err
+
+
 def test_help_says_that_no_arm_was_moved(capsys):
     with pytest.raises(SystemExit):
         cli.main(["robot", "--help"])
