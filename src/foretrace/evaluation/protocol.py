@@ -38,7 +38,8 @@ from foretrace.predictor.checkpoint import settings_of
 from foretrace.predictor.known import observed_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import rest_states, valid_lengths, valid_samples
-from foretrace.predictor.training import find_device, fit_predictor, thread_count
+from foretrace.predictor.surroundings import find_device, thread_count
+from foretrace.predictor.training import fit_predictor
 
 SEEDS = tuple(range(10))
 """The paper's ten randomisation seeds."""

@@ -33,7 +33,8 @@ from foretrace.interactions.splits import Split, split_by_object
 from foretrace.predictor import EffectPredictor, TrainConfig
 from foretrace.predictor.known import KNOWN
 from foretrace.predictor.run_folder import fingerprint
-from foretrace.predictor.training import fit_predictor, thread_count
+from foretrace.predictor.surroundings import thread_count
+from foretrace.predictor.training import fit_predictor
 
 EXPERIMENT = "randomisation"
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"

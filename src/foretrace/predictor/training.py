@@ -35,6 +35,7 @@ from foretrace.predictor.states import (
     valid_lengths,
     valid_samples,
 )
+from foretrace.predictor.surroundings import find_device, seeded, thread_count
 from foretrace.trajectories import final_distance, mean_distance
 
 
@@ -305,7 +306,7 @@ class _Training:
         order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.states))
         total = torch.zeros((), device=device)
         predictor.train()
-        with _seeded(self.config.seed, epoch, device):
+        with seeded(self.config.seed, epoch, device):
             batches = torch.from_numpy(order).split(self.config.batch_size)
             for number, rows in enumerate(batches):
                 share = (epoch - 1 + number / len(batches)) / self.epochs
@@ -344,18 +345,6 @@ class _Training:
         }
 
 
-def find_device(name: str) -> torch.device:
-    """The device of a name.
-
-    Raises:
-        TrainingError: ``cuda`` was asked for and there is none.
-    """
-    available = torch.cuda.is_available()
-    if name == "cuda" and not available:
-        raise TrainingError("device 'cuda' was asked for and PyTorch finds none here: use 'auto' or 'cpu'")
-    return torch.device("cuda" if available and name != "cpu" else "cpu")
-
-
 def _choose_split(batch: InteractionBatch, config: TrainConfig) -> Split:
     usable = np.flatnonzero(np.isin(batch.outcome, config.outcomes) & (valid_lengths(batch) >= 2))
     if len(usable) == 0:
@@ -382,29 +371,7 @@ def _prepare(batch: InteractionBatch, predictor: EffectPredictor, inputs: Tensor
 def _made(config: TrainConfig, batch: InteractionBatch) -> Iterator[EffectPredictor]:
     """The untrained predictor on its device, and PyTorch's random numbers seeded for its training."""
     device = find_device(config.device)
-    with _seeded(config.seed, 0, device):
+    with seeded(config.seed, 0, device):
         predictor = config.make_predictor(batch.com.shape[1]).to(device)
         predictor.set_precision(fast_precision(device) if config.precision == "auto" else config.precision)
         yield predictor
-
-
-@contextmanager
-def _seeded(seed: int, epoch: int, device: torch.device) -> Iterator[None]:
-    """PyTorch's random numbers from a seed for a while, and afterwards the caller's as they were.
-
-    Every epoch has its own seed, so that a resumed training needs no state of a generator.
-    """
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        torch.manual_seed(int(np.random.SeedSequence([seed, epoch]).generate_state(1)[0]))
-        yield
-
-
-@contextmanager
-def thread_count(threads: int | None) -> Iterator[None]:
-    """PyTorch with so many threads for a while; None leaves its choice."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
