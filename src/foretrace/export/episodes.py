@@ -84,7 +84,9 @@ def choose(data: Path, ids: Sequence[int] | None = None, run: Path | None = None
     if unknown := [id for id in ids if id not in row_of]:
         listed = ", ".join(map(str, unknown[:MOST_LISTED])) + " and more" * (len(unknown) > MOST_LISTED)
         there = f"{known.min()} to {known.max()}" if len(known) else "none"
-        raise ExportError(f"{data} has no interaction {listed} with a motion: there are {len(known)} ({there})")
+        raise ExportError(
+            f"{data} has no interaction {listed} with a motion: there are {len(known)} ({there})"
+        )
     predictor = None if run is None else load_predictor(run)
     if predictor is not None and predictor.features.oracle:
         raise PredictionError(

@@ -1,4 +1,4 @@
-"""Pictures of an interaction over time: rendered again from its recorded poses, as a camera beside the table sees them."""
+"""Pictures of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs.
@@ -19,9 +19,9 @@ from foretrace.simulation.tool import Tool, add_blade
 
 CAMERA = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 """The camera's intrinsics."""
-CAMERA_POSITION = np.array([0.12, -0.5, 0.36])
+CAMERA_POSITION = np.array([0.06, -0.36, 0.42])
 """Where it stands in the action frame [m]: to the right of the action, looking down on it."""
-CAMERA_AIM = np.array([0.07, 0.0, 0.02])
+CAMERA_AIM = np.array([0.04, 0.0, 0.04])
 """The point in the action frame that it looks at [m]."""
 
 

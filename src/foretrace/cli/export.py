@@ -1,0 +1,87 @@
+"""Commands that write interactions for other tools: export rosbag, rerun, lerobot."""
+
+from pathlib import Path
+from typing import Literal
+
+ROS, RERUN = ("rosbags", "ros"), ("rerun", "rerun")
+"""Libraries that are not installed by default, and the extras that bring them."""
+
+
+def export_rosbag(
+    data: Path,
+    ids: tuple[int, ...],
+    out: Path,
+    run: Path | None = None,
+    ros: Literal[1, 2] = 2,
+    camera: bool = True,
+) -> None:
+    """Write interactions as ROS bags, one each, and the RViz configuration that shows them. Needs foretrace[ros].
+
+    Args:
+        data: Folder of the data set.
+        ids: Numbers of the interactions.
+        out: Folder to make for the bags.
+        run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
+        ros: Version of ROS. 2: MCAP. 1: a .bag file.
+        camera: Whether simulated interactions get the pictures of a camera beside the table.
+    """
+    from foretrace.export.delivery import require
+    from foretrace.export.episodes import choose
+
+    require(*ROS)
+    from foretrace.export.rosbag import export_rosbags
+
+    export_rosbags(choose(data, ids, run), out, ros, camera)
+    _say_what_is_in(out)
+
+
+def export_rerun(
+    data: Path, ids: tuple[int, ...], out: Path, run: Path | None = None, camera: bool = True
+) -> None:
+    """Write interactions as Rerun recordings, one each. Needs foretrace[rerun].
+
+    Args:
+        data: Folder of the data set.
+        ids: Numbers of the interactions.
+        out: Folder to make for the recordings.
+        run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
+        camera: Whether simulated interactions get the pictures of a camera beside the table.
+    """
+    from foretrace.export.delivery import require
+    from foretrace.export.episodes import choose
+
+    require(*RERUN)
+    from foretrace.export import rerun
+
+    rerun.export_rerun(choose(data, ids, run), out, camera)
+    _say_what_is_in(out)
+
+
+def export_lerobot(
+    data: Path,
+    out: Path,
+    ids: tuple[int, ...] | None = None,
+    run: Path | None = None,
+    fps: int | None = None,
+    camera: bool = False,
+) -> None:
+    """Write interactions as one LeRobotDataset v3.0, an episode each.
+
+    Args:
+        data: Folder of the data set.
+        out: Folder to make.
+        ids: Numbers of the interactions; by default all that have a motion.
+        run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
+        fps: Frames per second, to which all are resampled; by default the rate at which they were sampled.
+        camera: Render the pictures of a camera beside the table; for simulated interactions only.
+    """
+    from foretrace.export.episodes import choose
+    from foretrace.export.lerobot import export_lerobot
+
+    export_lerobot(choose(data, ids, run), out, fps, camera)
+    print(out)
+
+
+def _say_what_is_in(out: Path) -> None:
+    for path in sorted(out.iterdir()):
+        print(path)
