@@ -19,6 +19,7 @@ from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
 from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
+from foretrace.cli.export import export_lerobot, export_rerun, export_rosbag
 from foretrace.cli.figures import figures
 from foretrace.cli.learning import predict, train
 from foretrace.cli.non_flat import evaluate_non_flat
@@ -60,6 +61,10 @@ COMMANDS: dict[str, Command | Group] = {
     ),
     "figures": figures,
     "predict": predict,
+    "export": Group(
+        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot.",
+        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot},
+    ),
     "show": show,
     "describe": describe,
     "doctor": doctor,

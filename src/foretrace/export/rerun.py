@@ -111,7 +111,7 @@ def _log_scene(recording: rr.RecordingStream, episode: Episode) -> None:
     )
     log(
         "action/object/shape",
-        rr.Mesh3D(vertex_positions=flat, vertex_normals=facing, albedo_factor=_bytes(OBJECT)),
+        rr.Mesh3D(vertex_positions=flat, vertex_normals=facing, albedo_factor=[*_bytes(OBJECT), 150]),
     )
     if episode.imagined_pose is not None:
         log(
