@@ -16,9 +16,9 @@ from foretrace.geometry import (
     matrix_to_pose,
     pose_to_matrix,
     quaternion_to_matrix,
-    tilt,
     transform_points,
 )
+from foretrace.interactions.outcomes import lifted_samples, name_outcome
 from foretrace.interactions.record import (
     AS_TOLD,
     Effect,
@@ -34,16 +34,8 @@ from foretrace.simulation.engine import ENGINES, Engine, Motion
 from foretrace.simulation.tool import Tool
 
 CAMERAS = ("exact", "rgbd")
-LIFTED_TILT = np.deg2rad(3.0)
-"""An object tilted by more than this counts as lifted [rad]."""
 OFF_SAMPLES = 2
 """So many samples in a row off the blade are a slip; one alone is a bounce."""
-ROLLED_TURN = np.deg2rad(30.0)
-"""An object that turns by more than this about horizontal axes, its height unchanged, has rolled [rad]."""
-ROLLED_RISE = 0.05
-"""Rolling changes the height of the centre of mass by less than this part of its height at rest."""
-UPRIGHT_TILT = np.deg2rad(80.0)
-"""An object that rests, off the blade, with a larger tilt than this lies on another side [rad]."""
 FALL_DEPTH = 0.5
 """The record of a falling object ends this far below the table top, above the floor [m]."""
 CORNER_REACH = 0.004
@@ -233,12 +225,9 @@ def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -
     motion, fall = _until_the_floor(motion, obj, physics)
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
     com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
-    angle = tilt(rotation)
-    lifted = angle > LIFTED_TILT
-    if obj.is_round:  # turning about its own axis is no lifting
-        lifted &= com[:, 2] > (1 + ROLLED_RISE) * com[0, 2]
+    lifted = lifted_samples(obj, rotation, com[:, 2])
     slip = _slip_index(lifted, motion.on_blade)
-    outcome = _outcome(rotation, com[:, 2], lifted, bool(motion.on_blade[-1]), slip)
+    outcome = name_outcome(rotation, com[:, 2], lifted, bool(motion.on_blade[-1]), slip)
     corners, points = (), unknown
     end = len(com) if slip is None else slip
     if lifted[:end].any() and outcome != Outcome.ROLLED:
@@ -303,35 +292,6 @@ def _slip_index(lifted: Bool[np.ndarray, " time"], on_blade: Bool[np.ndarray, " 
         # At the record's end the missing samples count as off.
         lasting &= np.append(off[k:], np.ones(k, dtype=bool))
     return int(lasting.argmax()) if lasting.any() else None
-
-
-def _outcome(
-    rotation: Float[np.ndarray, "time 3 3"],
-    com_z: Float[np.ndarray, " time"],
-    lifted: Bool[np.ndarray, " time"],
-    on_blade_at_end: bool,
-    slip: int | None,
-) -> Outcome:
-    angle = tilt(rotation)
-    if _rolling_turn(rotation, com_z) > ROLLED_TURN:
-        return Outcome.ROLLED
-    if angle.max() > np.pi / 2 or (angle[-1] > UPRIGHT_TILT and not on_blade_at_end):
-        return Outcome.TUMBLED
-    if not lifted.any():
-        return Outcome.MISSED
-    return Outcome.LEVERED if slip is None else Outcome.SLIPPED
-
-
-def _rolling_turn(rotation: Float[np.ndarray, "time 3 3"], com_z: Float[np.ndarray, " time"]) -> float:
-    """Largest turn about horizontal axes within samples in a row at the height at rest [rad]."""
-    level = np.abs(com_z - com_z[0]) < ROLLED_RISE * com_z[0]
-    starts = np.flatnonzero(np.diff(level.astype(int), prepend=0) == 1)
-    stops = np.flatnonzero(np.diff(level.astype(int), append=0) == -1) + 1
-    turns = [
-        tilt(rotation[start:stop] @ rotation[start].T).max()
-        for start, stop in zip(starts, stops, strict=True)
-    ]
-    return float(max(turns))
 
 
 def _corner_counts(
