@@ -124,7 +124,7 @@ class UrController:
             raise RobotError("ur_rtde is not installed: run pip install 'foretrace[ur]'") from error
         self.host, self.timeout = host, timeout
         _greet(host)
-        self._receive = _keep(RTDEReceiveInterface(host, 1 / CONTROL_PERIOD, VARIABLES))
+        self._receive = _connect(host, lambda: RTDEReceiveInterface(host, 1 / CONTROL_PERIOD, VARIABLES))
         self._control: Any = None
         self._heard, self._timestamp = time.monotonic(), -np.inf
 
@@ -159,7 +159,9 @@ class UrController:
         from rtde_control import RTDEControlInterface
 
         flags = RTDEControlInterface.FLAG_NO_WAIT  # and not FLAG_UPLOAD_SCRIPT
-        self._control = _keep(RTDEControlInterface(self.host, 1 / CONTROL_PERIOD, flags))
+        self._control = _connect(
+            self.host, lambda: RTDEControlInterface(self.host, 1 / CONTROL_PERIOD, flags)
+        )
         self._control.reuploadScript()
         patience = time.monotonic() + PATIENCE
         # Each connection hears of it at its own time.
@@ -175,11 +177,15 @@ class UrController:
                 f"{self.host} did not take the watchdog of {self.timeout:g} s: the arm was not moved"
             )
 
-    def send(self, joints: Float[np.ndarray, "6"]) -> None:
-        """Give the next set point [rad], and wait until the one after it is due."""
+    def send(self, joints: Float[np.ndarray, "6"]) -> bool:
+        """Give the next set point [rad], and wait until the one after it is due; False if the connection broke."""
         start = self._control.initPeriod()
-        self._control.servoJ(joints.tolist(), 0.0, 0.0, CONTROL_PERIOD, LOOKAHEAD, GAIN)
+        try:
+            self._control.servoJ(joints.tolist(), 0.0, 0.0, CONTROL_PERIOD, LOOKAHEAD, GAIN)
+        except RuntimeError:  # it broke in the middle, and ur_rtde could not connect again
+            return False
         self._control.waitPeriod(start)
+        return True
 
     def stop(self) -> str:
         """Stop arm and program by every way that is left; returns which one answered, in words."""
@@ -203,9 +209,10 @@ class UrController:
         for thread in threads:
             thread.join(max(0.0, deadline - time.monotonic()))
 
-    def _stop_program(self) -> None:
-        self._control.servoStop(STOP_DECELERATION)
+    def _stop_program(self) -> bool:
+        stopped = self._control.servoStop(STOP_DECELERATION)
         self._control.stopScript()
+        return stopped
 
     def _stop_by_dashboard(self) -> bool:
         """Ask the dashboard server, over a connection of its own."""
@@ -246,15 +253,30 @@ def _greet(host: str) -> None:
         ) from error
 
 
-def _keep(interface: Any) -> Any:
-    """An object of ur_rtde, kept until the process ends: its destructor waits with Python's lock held."""
+def _connect(host: str, make: Callable[[], Any]) -> Any:
+    """An object of ur_rtde, kept until the process ends: its destructor waits with Python's lock held.
+
+    Raises:
+        RobotError: If it cannot connect.
+    """
+    try:
+        interface = make()
+    except RuntimeError as error:
+        raise RobotError(
+            f"{host} does not take the connection ({error}): look at the pendant's log"
+        ) from error
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(interface))
     return interface
 
 
-def _within(seconds: float, action: Callable[[], None]) -> bool:
-    """Whether an action that may hang ends within a time [s]; it goes on in the background if not."""
-    thread = threading.Thread(target=action, daemon=True)
-    thread.start()
-    thread.join(seconds)
-    return not thread.is_alive()
+def _within(seconds: float, action: Callable[[], bool]) -> bool:
+    """Whether an action that may hang succeeds within a time [s]; it goes on in the background if not."""
+    done = threading.Event()
+
+    def act() -> None:
+        with contextlib.suppress(RuntimeError):
+            if action():
+                done.set()
+
+    threading.Thread(target=act, daemon=True).start()
+    return done.wait(seconds)

@@ -179,10 +179,11 @@ def _move(
                 state = controller.state()
                 recording.add(leg.name, state, recent[-1])
                 reason = _reason_to_stop(controller, state, recent, watch)
+                if not reason and not controller.send(set_point):
+                    reason = "connection lost"
                 if reason:
                     stopped_at = f"{reason}, {leg.name}, sample {sample} of {len(leg.joints)}"
                     break
-                controller.send(set_point)
                 recent.append(set_point)
             if stopped_at:
                 break
