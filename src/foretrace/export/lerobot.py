@@ -151,7 +151,7 @@ def _write_data(episodes: Sequence[Episode], layout: Layout, folder: Path) -> li
     sink, writer = _open(folder, chunk, file, schema)
     try:
         for number, episode in enumerate(watched(episodes, "episodes")):
-            if sink.tell() + largest > FILE_SIZE:
+            if number > 0 and sink.tell() + largest > FILE_SIZE:
                 writer.close()
                 sink.close()
                 chunk, file = (chunk, file + 1) if file + 1 < FILES_PER_CHUNK else (chunk + 1, 0)
