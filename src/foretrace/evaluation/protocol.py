@@ -21,7 +21,7 @@ from foretrace.evaluation.experiments import METRICS
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_machine, finished_trials
 from foretrace.evaluation.runner import Failure, run_trials
 from foretrace.evaluation.support import support_point_metrics
-from foretrace.features import FEATURES, Option, make_features
+from foretrace.features import FEATURES, Option, Outline, make_features
 from foretrace.features.base import fast_precision
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.record import Outcome
@@ -109,7 +109,7 @@ _PLAIN_SUPPORT: dict[str, dict[str, Option]] = {
     "sp-pred": {"aligned": False, "snapped": False, "epochs": 500, "batch_size": 32},
     "sp-rule": {"setback": 0.0, "half_width": 0.0},
 }
-_ALL = tuple(FEATURES)
+_ALL = tuple(label for label in FEATURES if label != Outline.label)
 
 EXPERIMENTS: dict[str, Experiment] = {
     "support-points": Experiment(

@@ -4,6 +4,7 @@ from foretrace.errors import TrainingError
 from foretrace.features.autoencoder import Autoencoder256, Autoencoder512
 from foretrace.features.base import FeatureExtractor, FitPart, NoFeatures, Option, Precision, option_names
 from foretrace.features.cnn import ImageCnn, ShapeContextCnn
+from foretrace.features.outline import Outline
 from foretrace.features.shape_context import ShapeContext200, ShapeContext800, ShapeContext3200
 from foretrace.features.support_points import (
     ObservedSupportPoints,
@@ -19,6 +20,7 @@ FEATURES: dict[str, type[FeatureExtractor]] = {
         *(ShapeContext200, ShapeContext800, ShapeContext3200),
         *(Autoencoder256, Autoencoder512),
         *(SupportPointsByRule, PredictedSupportPoints, ObservedSupportPoints),
+        Outline,
     )
 }
 """Every feature extractor by its label in the paper's figures."""
@@ -53,6 +55,7 @@ __all__ = [
     "NoFeatures",
     "ObservedSupportPoints",
     "Option",
+    "Outline",
     "Precision",
     "PredictedSupportPoints",
     "ShapeContext200",
