@@ -22,6 +22,7 @@ LARGEST_SNAP = 0.02
 def train(
     data: Path,
     out: Path,
+    predictor: str = "lstm",
     features: str = "im-cnn",
     state: Literal["position", "pose"] = "position",
     steps_ahead: int = 1,
@@ -43,6 +44,7 @@ def train(
     Args:
         data: Folder of the data set.
         out: Folder of the training: model, settings, metrics, split, TensorBoard events.
+        predictor: Kind of predictor: lstm, or one-shot, which needs the features outline and predicts poses.
         features: What the predictor knows about the object; an unknown label lists the choices.
         state: Predict the centre of mass, or the whole pose.
         steps_ahead: States predicted per iteration (n in the paper).
@@ -69,6 +71,7 @@ def train(
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
     config = TrainConfig(
+        predictor=predictor,
         features=features,
         state=state,
         steps_ahead=steps_ahead,

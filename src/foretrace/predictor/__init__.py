@@ -3,6 +3,7 @@
 from foretrace.predictor.base import EffectPredictor, ImaginedBatch, ImaginedEffect
 from foretrace.predictor.checkpoint import PREDICTORS, load_predictor, save_checkpoint
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
+from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.run_folder import part_of
 from foretrace.predictor.training import TrainConfig, train_predictor
 
@@ -13,6 +14,8 @@ __all__ = [
     "ImaginedEffect",
     "LstmConfig",
     "LstmPredictor",
+    "OneShotConfig",
+    "OneShotPredictor",
     "TrainConfig",
     "load_predictor",
     "part_of",

@@ -97,6 +97,17 @@ class EffectPredictor(nn.Module, ABC):
     def config(self) -> Any:
         """The frozen dataclass of settings that this predictor was made with."""
 
+    def prepare(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        states: Float[Tensor, "batch time state"],
+        lengths: Int[Tensor, " batch"],
+    ) -> None:
+        """Take from the whole training part what is needed before the first step; by default nothing.
+
+        The arguments are those of `training_loss`.
+        """
+
     @abstractmethod
     def training_loss(
         self,
@@ -108,6 +119,10 @@ class EffectPredictor(nn.Module, ABC):
 
         ``features`` are those of the object and, behind them, what is known: as from `add_known`.
         """
+
+    def validation_loss(self, off: Float[np.ndarray, "samples state"]) -> float:
+        """What the best epoch has least of, from how far imagined normalised states are off: the mean square."""
+        return float(np.mean(off**2))
 
     @abstractmethod
     def roll_out(

@@ -1,7 +1,7 @@
 """Predictors on disk: ``config.json`` and ``model.safetensors``. Nothing is ever unpickled."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,18 @@ from foretrace.features import make_features
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.files import write_json, write_tensors
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
+from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 
 FORMAT = "foretrace-predictor"
 FORMAT_VERSION = 1
 CONFIG = "config.json"
 MODEL = "model.safetensors"
-PREDICTORS: dict[str, tuple[type[LstmPredictor], type[LstmConfig]]] = {
-    LstmPredictor.label: (LstmPredictor, LstmConfig)
+PREDICTORS: dict[str, tuple[Callable[..., EffectPredictor], type[LstmConfig] | type[OneShotConfig]]] = {
+    LstmPredictor.label: (LstmPredictor, LstmConfig),
+    OneShotPredictor.label: (OneShotPredictor, OneShotConfig),
 }
 """Every kind of predictor by its label, with the class of its settings."""
-ADDED_SETTINGS: dict[str, Any] = {"known": ()}
+ADDED_SETTINGS: dict[str, Any] = {"known": (), "predictor": "lstm"}
 """Settings that older checkpoints and results do not name, and what they were in effect."""
 
 

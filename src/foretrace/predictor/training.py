@@ -21,11 +21,12 @@ from foretrace.features.fitting import learning_rate
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.checkpoint import load_tensors, read_tensors, settings_of
+from foretrace.predictor.checkpoint import PREDICTORS, load_tensors, read_tensors, settings_of
 from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.files import write_tensors
 from foretrace.predictor.known import check_names, observed_values
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
+from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
 from foretrace.predictor.states import (
@@ -43,6 +44,9 @@ from foretrace.trajectories import final_distance, mean_distance
 class TrainConfig:
     """Settings of a training; the defaults are the paper's where the paper says (section 4)."""
 
+    predictor: str = "lstm"
+    """What kind of predictor: a label of PREDICTORS. ``one-shot`` needs the features ``outline``, always predicts
+    poses, and of the settings of networks looks at ``hidden`` alone."""
     features: str = "im-cnn"
     """What the predictor knows about the object: a label of FEATURES."""
     feature_options: dict[str, Option] = field(default_factory=dict)
@@ -87,6 +91,8 @@ class TrainConfig:
         if not self.learning_rate > 0:
             raise TrainingError(f"learning_rate must be positive, not {self.learning_rate}")
         check_names(self.known)
+        if self.predictor not in PREDICTORS:
+            raise TrainingError(f"unknown predictor {self.predictor!r}; available: {', '.join(PREDICTORS)}")
 
     def num_epochs(self, size: int) -> int:
         """Passes over a training part of so many interactions."""
@@ -95,6 +101,8 @@ class TrainConfig:
     def make_predictor(self, num_samples: int) -> EffectPredictor:
         """The untrained predictor that these settings ask for."""
         features = make_features(self.features, **self.feature_options)
+        if self.predictor == OneShotPredictor.label:
+            return OneShotPredictor(features, num_samples, OneShotConfig(self.hidden, known=self.known))
         settings = LstmConfig(
             self.state, self.steps_ahead, self.hidden, self.window, self.residual, self.known
         )
@@ -261,6 +269,7 @@ class _Training:
         if done is None:
             done = Progress()
             self._fit_features(report)
+            self._prepare_predictor()
             self.keeper.save(done, self.predictor, self.optimizer)
         fixed = None if self.predictor.features.trainable else self._features_of(self.train)
         fixed_validation = None if fixed is None else self._features_of(self.validation)
@@ -296,6 +305,11 @@ class _Training:
             features.fit(train, validation, seed=seed, report=report)
             self.fitted.mkdir(parents=True, exist_ok=True)
             write_tensors(file, features.state_dict())
+
+    def _prepare_predictor(self) -> None:
+        if type(self.predictor).prepare is not EffectPredictor.prepare:
+            with torch.no_grad():
+                self.predictor.prepare(self._features_of(self.train), self.states, self.lengths)
 
     def _features_of(self, part: _Part) -> Tensor:
         return self.predictor.add_known(self.predictor.compute_features(part.inputs), part.known)
@@ -339,7 +353,7 @@ class _Training:
         off = (imagined - part.states)[valid] / predictor.state_scale.cpu().numpy()
         truth = np.where(valid[..., None], part.batch.com, np.nan)
         return {
-            "validation_loss": float(np.mean(off**2)),
+            "validation_loss": predictor.validation_loss(off),
             "validation_full_cm": 100 * float(np.mean(mean_distance(imagined[..., :3], truth))),
             "validation_final_cm": 100 * float(np.mean(final_distance(imagined[..., :3], truth))),
         }
