@@ -5,7 +5,7 @@ square has two poses that look nearly alike from afar; both are kept, for only t
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -41,10 +41,18 @@ BLURRED = 15.0
 SMALLEST_SIDE = 10.0
 """A marker of fewer pixels along its shortest side tells no pose."""
 
-CELL = 8
-"""Pixels along a module of the pattern that pictures are aligned with."""
-LARGEST_ALIGNMENT = 3.0
+CELL = 16
+"""Pixels along a module of the pattern that is drawn."""
+OVERSAMPLING = 4
+"""It is drawn with so many times the picture's pixels, then averaged."""
+BLUR = 0.8
+"""Standard deviation of what lens and sensor blur [pixel]."""
+BORDER = 6
+"""Pixels round a marker that are looked at."""
+LARGEST_ALIGNMENT = 6.0
 """Alignment that moves a corner further than this has gone astray [pixel]."""
+LEAST_CORRELATION = 0.7
+"""A picture that resembles the pattern less shows the marker covered or smeared."""
 
 
 @dataclass(frozen=True)
@@ -97,34 +105,74 @@ def detect_markers(picture: UInt8[np.ndarray, "rows columns *channels"], name: s
 
 
 def align_patterns(
-    picture: UInt8[np.ndarray, "rows columns *channels"], detections: Detections, name: str
+    picture: UInt8[np.ndarray, "rows columns *channels"],
+    detections: Detections,
+    name: str,
+    only: Collection[int] | None = None,
 ) -> Detections:
     """Corners found anew from all of each marker's pattern, not from its outer rim alone; slower.
 
     The known pattern, blurred as far as a pixel blurs, is aligned with the picture (Evangelidis and Psarakis, 2008); a
-    marker that cannot be aligned keeps its corners.
+    marker that cannot be aligned is covered or smeared, and left out.
+
+    Args:
+        picture: The picture.
+        detections: What was detected in it.
+        name: The markers' dictionary.
+        only: Markers to treat; others are left out. By default all.
     """
     values, found = grey(picture), dictionary(name)
-    modules = found.markerSize + 4  # the code, its black rim and one module of the white margin
-    middle, half = CELL * modules / 2 - 0.5, CELL * (modules - 2) / 2
-    reference = (middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).astype(np.float32)
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
-    aligned, everywhere = detections.corners.copy(), np.full(values.shape, 255, np.uint8)
-    for k, (id, corners) in enumerate(zip(detections.ids, detections.corners, strict=True)):
-        marker = cv2.aruco.generateImageMarker(found, int(id), CELL * (modules - 2), borderBits=1)
-        pattern = np.pad(marker, CELL, constant_values=255)
-        pattern = cv2.GaussianBlur(pattern, (0, 0), 2 * half / shortest_side(corners))
-        start = cv2.getPerspectiveTransform(reference, corners.astype(np.float32)).astype(np.float32)
-        try:
-            _, homography = cv2.findTransformECC(
-                pattern, values, start, cv2.MOTION_HOMOGRAPHY, stop, everywhere, 5
-            )
-        except cv2.error:
+    kept, aligned = [], []
+    for id, corners in zip(detections.ids, detections.corners, strict=True):
+        if only is not None and id not in only:
             continue
-        moved = cv2.perspectiveTransform(reference[None], homography)[0].astype(float)
-        if np.linalg.norm(moved - corners, axis=1).max() < LARGEST_ALIGNMENT:
-            aligned[k] = moved
-    return Detections(detections.ids, aligned)
+        # Once more from where the first alignment led: what is drawn then has the right slant.
+        moved = _align(values, found, int(id), corners)
+        moved = None if moved is None else _align(values, found, int(id), moved)
+        if moved is not None and np.linalg.norm(moved - corners, axis=1).max() < LARGEST_ALIGNMENT:
+            kept.append(int(id))
+            aligned.append(moved)
+    return Detections(np.array(kept, dtype=int), np.array(aligned).reshape(-1, 4, 2))
+
+
+def _align(
+    values: UInt8[np.ndarray, "rows columns"],
+    found: cv2.aruco.Dictionary,
+    id: int,
+    corners: Float[np.ndarray, "4 2"],
+) -> Float[np.ndarray, "4 2"] | None:
+    """A marker's corners after aligning the picture with the pattern drawn as a camera would see it there."""
+    modules = found.markerSize + 2  # the code and its black rim
+    marker = cv2.aruco.generateImageMarker(found, id, CELL * modules, borderBits=1)
+    pattern = np.pad(marker, CELL, constant_values=255)
+    frame = CELL * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * modules / 2
+    middle = CELL * (modules + 2) / 2 - 0.5
+    low = np.floor(corners.min(axis=0)).astype(int) - BORDER
+    high = np.ceil(corners.max(axis=0)).astype(int) + BORDER + 1
+    if (low < 0).any() or (high > [values.shape[1], values.shape[0]]).any():
+        return None
+    patch = values[low[1] : high[1], low[0] : high[0]]
+    fine = (OVERSAMPLING * (corners - low + 0.5) - 0.5).astype(np.float32)
+    to_fine = cv2.getPerspectiveTransform((frame + middle).astype(np.float32), fine)
+    size = (OVERSAMPLING * patch.shape[1], OVERSAMPLING * patch.shape[0])
+    drawn = cv2.warpPerspective(pattern, to_fine, size, flags=cv2.INTER_AREA, borderValue=255)
+    drawn = cv2.resize(drawn, patch.shape[::-1], interpolation=cv2.INTER_AREA)
+    drawn = cv2.GaussianBlur(drawn, (0, 0), BLUR)
+    # Up to half a module of the margin counts: further out, what lies round the marker shines in.
+    rim = cv2.perspectiveTransform((frame * (1 + 1 / modules) + middle)[None].astype(np.float32), to_fine)[0]
+    inside = np.zeros(patch.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(inside, np.rint((rim + 0.5) / OVERSAMPLING - 0.5).astype(np.int32), 255)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
+    try:
+        likeness, to_drawn = cv2.findTransformECC(
+            patch, drawn, np.eye(3, dtype=np.float32), cv2.MOTION_HOMOGRAPHY, stop, inside, 3
+        )
+    except cv2.error:  # it did not converge
+        return None
+    if likeness < LEAST_CORRELATION:
+        return None
+    back = np.linalg.inv(to_drawn.astype(float))
+    return cv2.perspectiveTransform((corners - low)[None], back)[0].astype(float) + low
 
 
 def grey(picture: Shaped[np.ndarray, "rows columns *channels"]) -> UInt8[np.ndarray, "rows columns"]:

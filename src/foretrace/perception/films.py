@@ -1,0 +1,126 @@
+"""Films to read: a folder of frames with time stamps, a video, or a ROS bag."""
+
+import csv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from foretrace.errors import PerceptionError
+from foretrace.interactions import film_folder
+from foretrace.interactions.film_folder import FilmNotes, Frame
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.calibration import read_picture
+
+VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
+BAGS = (".bag", ".mcap", ".db3")
+
+
+@dataclass(frozen=True)
+class Film:
+    """Frames in order, and what lies beside them."""
+
+    path: Path
+    """Where it was read from."""
+    frames: Callable[[], Iterator[Frame]]
+    """Reads the frames, from the beginning each time."""
+    notes: FilmNotes = field(default_factory=FilmNotes)
+    """What the film says about itself."""
+    camera: PinholeCamera | None = None
+    """The camera, if the film names it."""
+
+    def beside(self, name: str) -> Path | None:
+        """A file that belongs to the film, if it is there."""
+        folder = self.path if self.path.is_dir() else self.path.parent
+        return folder / name if (folder / name).is_file() else None
+
+    def background(self) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """The table before the object was put there, if the film has it."""
+        path = self.beside(film_folder.BACKGROUND)
+        return None if path is None else read_picture(path)
+
+
+def open_film(path: str | Path, topic: str | None = None) -> Film:
+    """A film of any of the kinds that are read.
+
+    Args:
+        path: A folder with ``timestamps.csv``, a video file, or a bag of ROS 1 or ROS 2.
+        topic: Image topic of a bag; needed if it has several.
+
+    Raises:
+        PerceptionError: There is none, or it is of no known kind.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise PerceptionError(f"no recording at {path}: check the path")
+    if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+        from foretrace.perception.bags import open_bag
+
+        frames, camera = open_bag(path, topic)
+        return Film(path, frames, camera=camera)
+    if path.is_dir():
+        notes = FilmNotes.load(path)
+        stored = path / film_folder.CAMERA
+        camera = PinholeCamera.load(stored) if stored.is_file() else None
+        rows = _read_times(path)
+        return Film(path, lambda: _folder_frames(path, rows, notes), notes, camera)
+    if path.suffix.lower() in VIDEOS:
+        return Film(path, lambda: _video_frames(path))
+    kinds = f"a folder with {film_folder.TIMES}, a video ({', '.join(VIDEOS)}) or a bag ({', '.join(BAGS)})"
+    raise PerceptionError(f"{path} is no recording that can be read: give {kinds}")
+
+
+def _read_times(folder: Path) -> list[tuple[float, str, str]]:
+    path = folder / film_folder.TIMES
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        found = [(float(row["time_s"]), row["colour"], row.get("depth") or "") for row in rows]
+    except OSError as error:
+        raise PerceptionError(
+            f"{folder} has no {film_folder.TIMES} ({error.strerror}): write a line per frame with "
+            f"{', '.join(film_folder.COLUMNS)}"
+        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise PerceptionError(
+            f"{path} cannot be read ({error!r}): its columns are {', '.join(film_folder.COLUMNS)}"
+        ) from error
+    if not found:
+        raise PerceptionError(f"{path} lists no frame")
+    return found
+
+
+def _folder_frames(folder: Path, rows: list[tuple[float, str, str]], notes: FilmNotes) -> Iterator[Frame]:
+    for time, colour, depth_name in rows:
+        depth = None
+        if depth_name:
+            steps = cv2.imread(str(folder / depth_name), cv2.IMREAD_UNCHANGED)
+            if steps is None or steps.ndim != 2:
+                raise PerceptionError(f"cannot read a depth picture from {folder / depth_name}")
+            depth = steps.astype(float) * notes.depth_unit
+        yield Frame(time, read_picture(folder / colour), depth)
+
+
+def _video_frames(path: Path) -> Iterator[Frame]:
+    """The frames of a video, at the times that the file states."""
+    video = cv2.VideoCapture(str(path))
+    if not video.isOpened():
+        raise PerceptionError(f"video {path} cannot be opened: it is damaged or of an unknown kind")
+    stated, count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0
+    try:
+        while True:
+            time = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            there, picture = video.read()
+            if not there:
+                break
+            yield Frame(float(time), picture)
+            count += 1
+    finally:
+        video.release()
+    if count == 0 or count < stated:
+        raise PerceptionError(
+            f"video {path} is cut off: it states {stated} frames, {count} can be read; copy it again"
+        )

@@ -1,0 +1,278 @@
+"""Where the object is in a picture: by what changed, brightness, colour or GrabCut; by height in a depth picture."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from foretrace.errors import PerceptionError
+from foretrace.geometry import invert_transform
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.topdown import MINIMAL_HEIGHT
+
+LEAST_CHANGE = 14.0
+"""A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
+EDGE_WIDTH = 9
+"""Within so many pixels a blurred edge has risen to its full height."""
+SMALLEST_OBJECT = 400
+"""An object of fewer pixels is taken for noise."""
+PLANE_SAMPLES = 20000
+"""Points that a plane is fitted to; more tell no more."""
+PLANE_TRIALS = 300
+"""Triples of points that are tried."""
+PLANE_REACH = 0.006
+"""Points closer to the plane than this belong to it [m]."""
+LEAST_PLANE = 0.3
+"""The table must hold at least this share of the points."""
+
+
+def mask_by_background(
+    picture: UInt8[np.ndarray, "rows columns 3"],
+    background: UInt8[np.ndarray, "rows columns 3"],
+    least_change: float = LEAST_CHANGE,
+) -> Bool[np.ndarray, "rows columns"]:
+    """Pixels that differ from a picture of the same place without the object.
+
+    A change of the light as a whole is taken out first: the one gain for each colour that most pixels agree on.
+
+    Raises:
+        PerceptionError: The pictures differ in size or in nearly everything.
+    """
+    if picture.shape != background.shape:
+        raise PerceptionError(
+            f"picture of {picture.shape[1]} x {picture.shape[0]} pixels and background of {background.shape[1]} x "
+            f"{background.shape[0]}: take both with one camera"
+        )
+    now, before = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8) for image in (picture, background))
+    gain = np.median((now + 1.0) / (before + 1.0), axis=(0, 1))
+    change = np.abs(now - gain * before).max(axis=2)
+    mask = change > least_change
+    if mask.mean() > 0.6:
+        raise PerceptionError(
+            f"{100 * mask.mean():.0f} % of the picture differ from the background: was the camera moved or the light "
+            "switched? take both anew"
+        )
+    # Blur makes edges wide: they lie where the change has half of the height that it reaches close by.
+    height = cv2.dilate(cv2.medianBlur(change, 5), np.ones((EDGE_WIDTH, EDGE_WIDTH), np.uint8))
+    return mask & (change > 0.5 * height)
+
+
+def mask_by_threshold(
+    picture: UInt8[np.ndarray, "rows columns *channels"], dark_object: bool | None = None
+) -> Bool[np.ndarray, "rows columns"]:
+    """Pixels on the object's side of the brightness that parts the picture best (Otsu, 1979).
+
+    Args:
+        picture: The picture.
+        dark_object: Whether the object is darker than the table; by default what touches the border less is the object.
+    """
+    values = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    _, bright = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    bright = bright > 0
+    if dark_object is None:
+        dark_object = np.concatenate([bright[0], bright[-1], bright[:, 0], bright[:, -1]]).mean() > 0.5
+    return ~bright if dark_object else bright
+
+
+def mask_by_colour(
+    picture: UInt8[np.ndarray, "rows columns 3"], point: tuple[float, float], tolerance: float = 40.0
+) -> Bool[np.ndarray, "rows columns"]:
+    """Pixels of about the colour at a point (column, row), in the CIELAB space, brightness counting half.
+
+    Raises:
+        PerceptionError: The point lies outside the picture.
+    """
+    column, row = _inside(point, picture.shape)
+    lab = cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 1.0), cv2.COLOR_BGR2LAB).astype(np.float32)
+    patch = lab[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].reshape(-1, 3)
+    away = (lab - np.median(patch, axis=0)) * np.array([0.5, 1.0, 1.0], dtype=np.float32)
+    return np.linalg.norm(away, axis=2) < tolerance
+
+
+def mask_by_grabcut(
+    picture: UInt8[np.ndarray, "rows columns 3"], box: tuple[int, int, int, int], iterations: int = 5
+) -> Bool[np.ndarray, "rows columns"]:
+    """The object in a box by colours and edges (Rother, Kolmogorov and Blake, 2004).
+
+    Args:
+        picture: The picture.
+        box: Left column, upper row, width and height of a box round the whole object, some background in it.
+        iterations: Rounds of learning the colours and cutting.
+
+    Raises:
+        PerceptionError: The box leaves the picture or holds no object.
+    """
+    left, top, width, height = box
+    rows, columns = picture.shape[:2]
+    if left < 0 or top < 0 or width < 8 or height < 8 or left + width > columns or top + height > rows:
+        raise PerceptionError(
+            f"box {box} in a picture of {columns} x {rows} pixels: give left, top, width and height within it"
+        )
+    labels = np.zeros((rows, columns), dtype=np.uint8)
+    models = [np.zeros((1, 65)) for _ in range(2)]
+    cv2.setRNGSeed(0)
+    cv2.grabCut(
+        picture, labels, (left, top, width, height), models[0], models[1], iterations, cv2.GC_INIT_WITH_RECT
+    )
+    mask = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    if not mask.any():
+        raise PerceptionError(f"GrabCut finds no object in the box {box}: draw it round the object")
+    return mask
+
+
+def pick_object(
+    mask: Bool[np.ndarray, "rows columns"], point: tuple[float, float] | None = None, reach: float = 30.0
+) -> Bool[np.ndarray, "rows columns"]:
+    """One whole object of a mask, its holes filled and its specks removed.
+
+    Args:
+        mask: Pixels of objects.
+        point: Column and row on or near the object that is meant; by default the largest.
+        reach: How far from it the point may lie [pixel].
+
+    Raises:
+        PerceptionError: There is none, or none near the point, or the border cuts it off.
+    """
+    cleaned = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    # Holes first: a marker on the object may look like the table, and have islands in it.
+    contours, _ = cv2.findContours(cleaned, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    filled = cv2.drawContours(np.zeros_like(cleaned), contours, -1, 1, cv2.FILLED)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(filled, connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    large = 1 + np.flatnonzero(areas >= SMALLEST_OBJECT)
+    if len(large) == 0:
+        raise PerceptionError(
+            f"the mask is empty: its largest patch has {int(areas.max(initial=0))} pixels, an object has at least "
+            f"{SMALLEST_OBJECT}; check light and background, or move the camera nearer"
+        )
+    if point is None:
+        chosen = int(large[np.argmax(areas[large - 1])])
+    else:
+        column, row = _inside(point, mask.shape)
+        rows, columns = np.nonzero(np.isin(labels, large))
+        distance = np.hypot(rows - row, columns - column)
+        if distance.min() > reach:
+            raise PerceptionError(
+                f"point ({point[0]:.0f}, {point[1]:.0f}) lies {distance.min():.0f} pixels from the nearest of "
+                f"{len(large)} objects: give a point on the object"
+            )
+        nearest = int(distance.argmin())
+        chosen = int(labels[rows[nearest], columns[nearest]])
+    found = labels == chosen
+    for side, pixels in (
+        ("top", found[0]),
+        ("bottom", found[-1]),
+        ("left", found[:, 0]),
+        ("right", found[:, -1]),
+    ):
+        if pixels.any():
+            raise PerceptionError(f"the object is cut off by the {side} border of the picture: show it whole")
+    return found
+
+
+@dataclass(frozen=True)
+class TablePlane:
+    """The table in a depth picture."""
+
+    T_table_camera: Float[np.ndarray, "4 4"]
+    """The camera over the table: z out of the table, origin below the camera, x along the picture's columns."""
+    share: float
+    """Share of the points that lie on it."""
+    deviation: float
+    """Standard deviation of those points from it [m]."""
+
+
+def find_table(depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, seed: int = 0) -> TablePlane:
+    """The plane that most points of a depth picture lie on (RANSAC: Fischler and Bolles, 1981), then least squares.
+
+    Raises:
+        PerceptionError: The picture holds no depth, is another camera's, or shows no table.
+    """
+    camera.check_picture(depth, "depth picture")
+    points = camera.deproject(depth, np.eye(4))
+    if len(points) < 0.05 * depth.size:
+        raise PerceptionError(
+            f"the depth picture is empty: {len(points)} of {depth.size} pixels have depth; check the sensor's range "
+            "(0.3 to 3 m) and that nothing glossy fills the picture"
+        )
+    rng = np.random.default_rng(seed)
+    points = points[rng.choice(len(points), min(PLANE_SAMPLES, len(points)), replace=False)]
+    corners = points[rng.integers(len(points), size=(PLANE_TRIALS, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    corners, normals = corners[lengths > 1e-9], normals[lengths > 1e-9] / lengths[lengths > 1e-9, None]
+    away = np.abs(points @ normals.T - (corners[:, 0] * normals).sum(axis=1))
+    best = int((away < PLANE_REACH).sum(axis=0).argmax())
+    inside = away[:, best] < PLANE_REACH
+    for _ in range(5):
+        middle, normal = _fit_plane(points[inside])
+        distance = (points - middle) @ normal
+        inside = np.abs(distance) < PLANE_REACH
+    middle, normal = _fit_plane(points[inside])
+    if inside.mean() < LEAST_PLANE:
+        raise PerceptionError(
+            f"no table: the largest plane holds {100 * inside.mean():.0f} % of the points, at least "
+            f"{100 * LEAST_PLANE:.0f} % are needed; look down on the table"
+        )
+    normal = -normal if normal @ middle > 0 else normal  # towards the camera
+    along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    T = np.eye(4)
+    T[:3, 0], T[:3, 2] = along / np.linalg.norm(along), normal
+    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+    T[:3, 3] = normal * (middle @ normal)
+    return TablePlane(
+        invert_transform(T), float(inside.mean()), float(((points[inside] - middle) @ normal).std())
+    )
+
+
+def _fit_plane(points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Middle and normal of the plane nearest to points in the sense of least squares."""
+    middle = points.mean(axis=0)
+    return middle, np.linalg.svd(points - middle, full_matrices=False)[2][2]
+
+
+def heights_above_table(
+    depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, T_table_camera: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "rows columns"]:
+    """Height of what each pixel sees above the table [m]; NaN where nothing was seen."""
+    camera.check_picture(depth, "depth picture")
+    heights = np.full(depth.shape, np.nan)
+    seen = np.isfinite(depth) & (depth > 0)
+    heights[seen] = camera.deproject(depth, T_table_camera)[:, 2]
+    return heights
+
+
+def mask_by_height(
+    heights: Float[np.ndarray, "rows columns"], minimal_height: float = 2 * MINIMAL_HEIGHT
+) -> Bool[np.ndarray, "rows columns"]:
+    """Pixels that stand out of the table; pixels without depth take part with their neighbours."""
+    filled = cv2.medianBlur(np.where(np.isfinite(heights), heights, -1.0).astype(np.float32), 5)
+    return filled > minimal_height
+
+
+def object_height(
+    heights: Float[np.ndarray, "rows columns"], mask: Bool[np.ndarray, "rows columns"]
+) -> float:
+    """Height of a flat object's top [m]: the median over the middle of its mask.
+
+    Raises:
+        PerceptionError: No pixel of the mask has depth.
+    """
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    values = heights[inner & np.isfinite(heights)]
+    if len(values) == 0:
+        raise PerceptionError("no pixel of the object has depth: check that depth and colour pictures match")
+    top = values[values > 0.5 * np.median(values)]
+    return float(np.median(top))
+
+
+def _inside(point: tuple[float, float], shape: tuple[int, ...]) -> tuple[int, int]:
+    """A point's nearest pixel (column, row)."""
+    column, row = round(point[0]), round(point[1])
+    if not (0 <= column < shape[1] and 0 <= row < shape[0]):
+        raise PerceptionError(
+            f"point ({point[0]:g}, {point[1]:g}) lies outside a picture of {shape[1]} x {shape[0]} pixels: give column "
+            "and row"
+        )
+    return column, row

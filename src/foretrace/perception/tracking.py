@@ -1,0 +1,351 @@
+"""The path of a body with markers through a film: one pose per frame, smooth, without delay, with its uncertainty.
+
+Every frame gives up to two poses that explain it. Which one is meant is decided for the whole film at once, by the
+least reprojection error and the least turning from frame to frame (Viterbi, 1967). From there all frames are fitted
+together: the corners where they were seen, the motion with as little acceleration as they allow, outliers and
+impacts forgiven (Huber, 1964). What a fit of the whole film says of a frame lags behind nothing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from foretrace.errors import PerceptionError
+from foretrace.geometry import rotation_angle
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.markers import Detections, MarkerBody, PoseCandidate
+
+Matches = tuple[np.ndarray, np.ndarray]
+"""Points of the body and where they were seen."""
+NOTHING: Matches = (np.zeros((0, 3)), np.zeros((0, 2)))
+ITERATIONS = 12
+HUBER = 1.5
+"""Residuals up to so many standard deviations count in full."""
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """How markers are followed.
+
+    Raises:
+        PerceptionError: A value is not positive.
+    """
+
+    largest_gap: float = 0.25
+    """Gaps up to this long are bridged [s]; in longer ones the pose is NaN."""
+    largest_error: float = 3.0
+    """A frame whose best pose misses the corners by more counts as not seen [pixel]."""
+    turning: float = 6.0
+    """Turning that is taken for normal when two poses are told apart [rad/s]."""
+    acceleration: float = 0.3
+    """Acceleration that is taken for normal [m/s^2]; impacts are outliers."""
+    angular_acceleration: float = 3.0
+    """The same for rotations [rad/s^2]."""
+    least_noise: float = 0.05
+    """Corners are not taken for more certain than this [pixel]."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise PerceptionError(f"tracking: {name} = {value}, it must be positive")
+
+
+@dataclass(frozen=True)
+class Track:
+    """A body's path in the camera frame."""
+
+    times: Float[np.ndarray, " frame"]
+    """Time stamps [s]."""
+    T_camera_body: Float[np.ndarray, "frame 4 4"]
+    """The body in the camera frame; NaN in gaps that were not bridged."""
+    seen: Bool[np.ndarray, " frame"]
+    """Where markers were seen; the other poses are bridged or NaN."""
+    errors: Float[np.ndarray, " frame"]
+    """Root mean square of the reprojection error [pixel]; NaN where nothing was seen."""
+    covariance: Float[np.ndarray, "frame 6 6"]
+    """Covariance of rotation and position: a small turn about the camera's axes [rad], then metres."""
+    noise: float
+    """How precisely the corners were seen, in the film's own judgement [pixel]."""
+
+    def gaps(self) -> list[tuple[float, float]]:
+        """Beginning and end of each stretch without a pose [s]."""
+        lost = ~np.isfinite(self.T_camera_body[:, 0, 0])
+        return [(float(self.times[a]), float(self.times[b - 1])) for a, b in _runs(lost)]
+
+
+def track(
+    times: Float[np.ndarray, " frame"],
+    detections: Sequence[Detections],
+    body: MarkerBody,
+    camera: PinholeCamera,
+    config: TrackConfig = TrackConfig(),
+) -> Track:
+    """Follows a body through a film.
+
+    Args:
+        times: Time stamps [s], increasing.
+        detections: What was seen in each frame.
+        body: The markers on the body.
+        camera: The camera, which stands still.
+        config: How.
+
+    Raises:
+        PerceptionError: The times do not increase, or fewer than two frames show the body.
+    """
+    check_times(times)
+    candidates = [
+        [pose for pose in body.poses(seen, camera) if pose.error <= config.largest_error]
+        for seen in detections
+    ]
+    seen = np.array([bool(poses) for poses in candidates])
+    if seen.sum() < 2:
+        raise PerceptionError(
+            f"markers {body.ids} are seen in {int(seen.sum())} of {len(times)} frames, two are needed: "
+            "check ids, dictionary and light"
+        )
+    poses = np.full((len(times), 4, 4), np.nan)
+    covariance = np.full((len(times), 6, 6), np.nan)
+    indices = np.flatnonzero(seen)
+    chosen = choose_poses(times[indices], [candidates[k] for k in indices], config)
+    matches = [
+        body.matches(found) if there else NOTHING for found, there in zip(detections, seen, strict=True)
+    ]
+    noise = _corner_noise(
+        [candidates[k][0].error for k in indices], [len(matches[k][0]) for k in indices], config
+    )
+    deviations = np.full(len(times), noise.min())
+    deviations[indices] = noise
+    pieces = np.split(
+        np.arange(len(indices)), np.flatnonzero(np.diff(times[indices]) > config.largest_gap) + 1
+    )
+    for piece in pieces:
+        inside = np.arange(int(indices[piece[0]]), int(indices[piece[-1]]) + 1)
+        start = _bridge(times[inside], times[indices[piece]], chosen[piece])
+        poses[inside], covariance[inside] = _smooth(
+            times[inside], start, [matches[k] for k in inside], camera, deviations[inside], config
+        )
+    errors = np.full(len(times), np.nan)
+    for k in indices:
+        points, pixels = matches[k]
+        errors[k] = np.sqrt(((camera.project(points, poses[k]) - pixels) ** 2).sum(axis=1).mean())
+    return Track(times, poses, seen, errors, covariance, float(np.median(noise)))
+
+
+def check_times(times: Float[np.ndarray, " frame"]) -> None:
+    """Refuse time stamps that do not increase.
+
+    Raises:
+        PerceptionError: Naming the first frame that is not later than the one before.
+    """
+    if not np.isfinite(times).all():
+        raise PerceptionError(f"frame {int((~np.isfinite(times)).argmax())} has no time stamp")
+    if (np.diff(times) <= 0).any():
+        k = int((np.diff(times) <= 0).argmax())
+        raise PerceptionError(
+            f"time stamps do not increase: frame {k + 1} at {times[k + 1]:.6f} s follows {times[k]:.6f} s; "
+            "sort or film again"
+        )
+
+
+def choose_poses(
+    times: Float[np.ndarray, " frame"], candidates: Sequence[Sequence[PoseCandidate]], config: TrackConfig
+) -> Float[np.ndarray, "frame 4 4"]:
+    """One pose per frame: the sequence of least reprojection error and least turning (Viterbi, 1967)."""
+    noise = max(config.least_noise, float(np.median([poses[0].error for poses in candidates])))
+    costs = [np.array([(pose.error / noise) ** 2 for pose in poses]) for poses in candidates]
+    total, back = costs[0], []
+    for k in range(1, len(candidates)):
+        pairs = [[pose.T_camera_body[:3, :3] for pose in candidates[j]] for j in (k - 1, k)]
+        turns = rotation_angle(np.array(pairs[0])[:, None], np.array(pairs[1])[None])
+        scale = config.turning * (times[k] - times[k - 1])
+        reached = total[:, None] + (turns / scale) ** 2
+        back.append(reached.argmin(axis=0))
+        total = reached.min(axis=0) + costs[k]
+    best = [int(total.argmin())]
+    for pointers in reversed(back):
+        best.append(int(pointers[best[-1]]))
+    return np.array([poses[b].T_camera_body for poses, b in zip(candidates, reversed(best), strict=True)])
+
+
+def _corner_noise(
+    errors: Sequence[float], counts: Sequence[int], config: TrackConfig
+) -> Float[np.ndarray, " frame"]:
+    """Standard deviation of a corner's coordinates in each frame, from how well it fits itself [pixel].
+
+    Eight coordinates less a pose's six leave little to judge by: no frame is believed better than most are.
+    """
+    corners = np.asarray(counts)
+    freed = np.asarray(errors) * np.sqrt(corners / np.maximum(2 * corners - 6, 1))
+    return np.maximum(freed, max(config.least_noise, float(np.median(freed))))
+
+
+def _bridge(
+    times: Float[np.ndarray, " frame"],
+    known_times: Float[np.ndarray, " known"],
+    known: Float[np.ndarray, "known 4 4"],
+) -> Float[np.ndarray, "frame 4 4"]:
+    """Poses at all times, those between known ones interpolated."""
+    if len(known) == 1:
+        return np.repeat(known, len(times), axis=0)
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, 3] = np.column_stack([np.interp(times, known_times, known[:, i, 3]) for i in range(3)])
+    poses[:, :3, :3] = slerp(known_times, known[:, :3, :3], times)
+    return poses
+
+
+def slerp(
+    known_times: Float[np.ndarray, " known"],
+    rotations: Float[np.ndarray, "known 3 3"],
+    times: Float[np.ndarray, " time"],
+) -> Float[np.ndarray, "time 3 3"]:
+    """Rotations at some times between known ones; before the first and after the last they stay."""
+    after = np.clip(np.searchsorted(known_times, times), 1, len(known_times) - 1)
+    span = known_times[after] - known_times[after - 1]
+    share = np.clip((times - known_times[after - 1]) / span, 0.0, 1.0)
+    first = Rotation.from_matrix(rotations[after - 1])
+    step = (first.inv() * Rotation.from_matrix(rotations[after])).as_rotvec()
+    return np.asarray((first * Rotation.from_rotvec(share[:, None] * step)).as_matrix())
+
+
+def _smooth(
+    times: np.ndarray,
+    poses: Float[np.ndarray, "frame 4 4"],
+    matches: Sequence[Matches],
+    camera: PinholeCamera,
+    noise: Float[np.ndarray, " frame"],
+    config: TrackConfig,
+) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame 6 6"]]:
+    """All poses of a stretch fitted together by Gauss-Newton steps, and the covariance of each."""
+    poses = poses.copy()
+    information: Any = None
+    for _ in range(ITERATIONS):
+        jacobian, residual = _linearise(times, poses, matches, camera, noise, config)
+        # A little damping holds what neither corners nor neighbours determine.
+        information = (jacobian.T @ jacobian + 1e-6 * sparse.eye(6 * len(times))).tocsc()
+        step = splu(information).solve(-(jacobian.T @ residual)).reshape(-1, 6)
+        poses[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :3, :3]
+        poses[:, :3, 3] += step[:, 3:]
+        if np.abs(step).max() < 1e-7:
+            break
+    return poses, _diagonal_blocks(information)
+
+
+def _linearise(
+    times: np.ndarray,
+    poses: np.ndarray,
+    matches: Sequence[Matches],
+    camera: PinholeCamera,
+    noise: Float[np.ndarray, " frame"],
+    config: TrackConfig,
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Jacobian and residuals, each in its standard deviations, weighted against outliers."""
+    rows, columns, values, residuals = [], [], [], []
+    count = 0
+
+    def add(residual: np.ndarray, blocks: Sequence[tuple[int, np.ndarray]]) -> None:
+        nonlocal count
+        size = np.linalg.norm(residual) / np.sqrt(len(residual))
+        weight = np.sqrt(min(1.0, HUBER / max(size, 1e-12)))
+        residuals.append(weight * residual)
+        for start, block in blocks:
+            i, j = np.indices(block.shape)
+            rows.append((count + i).ravel())
+            columns.append((start + j).ravel())
+            values.append((weight * block).ravel())
+        count += len(residual)
+
+    for k, match in enumerate(matches):
+        if len(match[0]):
+            residual, block = _corner_terms(poses[k], *match, camera)
+            add(residual / noise[k], [(6 * k, block / noise[k])])
+    for part, scale in ((slice(0, 3), config.angular_acceleration), (slice(3, 6), config.acceleration)):
+        speeds = _speeds(times, poses, turning=part.start == 0)
+        for k in range(1, len(times) - 1):
+            before, after = times[k] - times[k - 1], times[k + 1] - times[k]
+            middle = (before + after) / 2
+            share = np.eye(3) / (middle * scale)
+            terms = ((k - 1, share / before), (k, -share / before - share / after), (k + 1, share / after))
+            blocks = [(6 * frame + part.start, block) for frame, block in terms]
+            add((speeds[k] - speeds[k - 1]) / (middle * scale), blocks)
+    shape = (count, 6 * len(times))
+    triplets = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_matrix(triplets, shape=shape), np.concatenate(residuals)
+
+
+def _speeds(times: np.ndarray, poses: np.ndarray, turning: bool) -> Float[np.ndarray, "steps 3"]:
+    if turning:
+        steps = Rotation.from_matrix(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)).as_rotvec()
+    else:
+        steps = np.diff(poses[:, :3, 3], axis=0)
+    return np.asarray(steps / np.diff(times)[:, None])
+
+
+def _corner_terms(
+    pose: np.ndarray, points: np.ndarray, pixels: np.ndarray, camera: PinholeCamera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reprojection error, and its change with a small turn about the camera's axes and a small shift."""
+    turned = points @ pose[:3, :3].T
+    projected, jacobian = cv2.projectPoints(
+        turned + pose[:3, 3], np.zeros(3), np.zeros(3), camera.matrix, camera.coefficients
+    )
+    by_shift = np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
+    x, y, z = turned.T
+    zero = np.zeros_like(x)
+    by_turn = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)  # -[turned]x
+    block = np.concatenate([by_shift @ by_turn, by_shift], axis=2).reshape(-1, 6)
+    return (projected.reshape(-1, 2) - pixels).ravel(), block
+
+
+def _diagonal_blocks(information: Any) -> Float[np.ndarray, "frame 6 6"]:
+    """The 6 x 6 blocks on the diagonal of the inverse."""
+    factors, size = splu(information), information.shape[0]
+    blocks = np.empty((size // 6, 6, 6))
+    for first in range(0, size, 600):
+        width = min(600, size - first)
+        unit = np.zeros((size, width))
+        unit[np.arange(first, first + width), np.arange(width)] = 1.0
+        solved = factors.solve(unit)
+        for j in range(0, width, 6):
+            blocks[(first + j) // 6] = solved[first + j : first + j + 6, j : j + 6]
+    return blocks
+
+
+def still_pose(
+    detections: Sequence[Detections],
+    body: MarkerBody,
+    camera: PinholeCamera,
+    config: TrackConfig = TrackConfig(),
+) -> Float[np.ndarray, "4 4"]:
+    """T_camera_body of a body that stands still, from all frames together: each corner at its median place.
+
+    Raises:
+        PerceptionError: No frame shows it well enough.
+    """
+    ids = np.concatenate([[id for id in body.ids if seen.of(id) is not None] for seen in detections])
+    # A marker counts that is seen at least half as often as the one seen most.
+    counts = {id: int((ids == id).sum()) for id in body.ids}
+    often = [id for id, count in counts.items() if count > 0 and 2 * count >= max(counts.values())]
+    places = [
+        np.median([corners for seen in detections if (corners := seen.of(id)) is not None], axis=0)
+        for id in often
+    ]
+    poses = body.poses(Detections(np.array(often, dtype=int), np.array(places).reshape(-1, 4, 2)), camera)
+    if not poses or poses[0].error > config.largest_error:
+        state = f"explained to {poses[0].error:.1f} pixels only" if poses else "not seen"
+        raise PerceptionError(
+            f"markers {body.ids} on the table are {state}: check their layout, sides, dictionary and light"
+        )
+    return poses[0].T_camera_body
+
+
+def _runs(flags: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
+    """Beginning and end (excluded) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,273 @@
+"""From an object's mask in a picture to its outline on the table, the lever-up and the view from above.
+
+A slanted camera sees the upper face shifted away from it, and the sides that face it. Both are undone for prisms: the
+mask is laid onto the plane of the upper face and onto the plane of the lower rim, and the object is where both agree.
+That is exact for convex outlines. What is assumed: vertical sides, the height that is given, and a lower rim at the
+height of the usual bevel.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+
+from foretrace.actions import LeverUp
+from foretrace.errors import PerceptionError, ShapeError
+from foretrace.geometry import convex_hull, invert_transform, transform_points
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.topdown import MINIMAL_HEIGHT, TopDownView
+from foretrace.objects import BEVEL, ObjectModel, Prism, silhouette_origin
+
+GRID = 0.0005
+"""Side of a pixel of the rectified mask [m]."""
+TOLERANCE = 0.002
+"""How far the polygon may leave the outline [m]: less would follow the noise of its edge, and so would directions."""
+LARGEST_OBJECT = 1.0
+"""No object is larger than this [m]."""
+LARGEST_SNAP = 0.02
+"""A contact further from the outline than this is refused [m]."""
+
+
+@dataclass(frozen=True)
+class PlacedObject:
+    """An object and where it lies."""
+
+    object: ObjectModel
+    """The object, in its own frame."""
+    T_table_object: Float[np.ndarray, "4 4"]
+    """Where its frame lies on the table."""
+
+    def outline(self, height: float = 0.0) -> Float[np.ndarray, "n 3"]:
+        """Its outline in the table frame at a height above the table [m]."""
+        corners = np.column_stack([self.object.corners, np.full(len(self.object.corners), height)])
+        return transform_points(self.T_table_object, corners)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a predictor needs to know of a picture."""
+
+    placed: PlacedObject
+    """The object on the table."""
+    action: LeverUp
+    """The lever-up, in the object frame."""
+    view: TopDownView
+    """The object from above, in the action frame."""
+
+    @property
+    def T_table_action(self) -> Float[np.ndarray, "4 4"]:
+        """The action frame in the table frame."""
+        return self.placed.T_table_object @ invert_transform(self.action.T_action_object)
+
+    @property
+    def com_in_action(self) -> Float[np.ndarray, "3"]:
+        """Centre of mass of the object at rest, uniform density assumed, in the action frame [m]."""
+        com = self.placed.object.mass_properties(1.0).com
+        return transform_points(self.action.T_action_object, com[None])[0]
+
+
+def place_object(
+    mask: Bool[np.ndarray, "rows columns"],
+    camera: PinholeCamera,
+    T_table_camera: Float[np.ndarray, "4 4"],
+    height: float,
+    rim: float = BEVEL.height,
+    hull: bool = False,
+) -> PlacedObject:
+    """The prism that a mask shows, on the table.
+
+    Args:
+        mask: The object in the picture, as the camera sees it.
+        camera: The camera.
+        T_table_camera: Its pose.
+        height: Height of the object's upper face [m].
+        rim: Height of its lower rim, where the mask begins [m].
+        hull: Take the convex hull of the outline (paper, section 5.4).
+
+    Raises:
+        PerceptionError: The mask is empty, of another camera, or leads to no believable object.
+    """
+    camera.check_picture(mask, "mask")
+    if not mask.any():
+        raise PerceptionError("the mask is empty: no object to place")
+    if not 0 <= rim < height < T_table_camera[2, 3]:
+        raise PerceptionError(
+            f"object from {rim} to {height} m high below a camera at {T_table_camera[2, 3]:.3f} m: check both"
+        )
+    rows, columns = np.nonzero(mask)
+    pixels = np.stack([columns, rows], axis=-1)[convex_hull_indices(columns, rows)].astype(float)
+    reach = np.concatenate([camera.on_plane(pixels, T_table_camera, level) for level in (rim, height)])
+    if not np.isfinite(reach).all() or np.ptp(reach, axis=0).max() > LARGEST_OBJECT:
+        raise PerceptionError(
+            "the mask reaches to the horizon or over a metre of table: check mask and camera pose"
+        )
+    low, high = reach.min(axis=0) - 4 * GRID, reach.max(axis=0) + 4 * GRID
+    size = np.ceil((high - low) / GRID).astype(int)
+    flat = _lay_out(mask, camera, T_table_camera, low, size, height)
+    flat &= _lay_out(mask, camera, T_table_camera, low, size, rim)
+    try:
+        prism = Prism.from_mask(flat, GRID, height, tolerance=TOLERANCE)
+        if hull:
+            prism = Prism(convex_hull(prism.corners), height, prism.bevel)
+    except ShapeError as error:
+        raise PerceptionError(f"the mask shows no usable object: {error}") from error
+    origin = silhouette_origin(_largest(flat))
+    T = np.eye(4)
+    T[:2, 3] = low + GRID * np.array([origin[1] + 0.5, size[1] - 1 - origin[0] + 0.5])
+    return PlacedObject(prism, T)
+
+
+def convex_hull_indices(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Which of many pixels are corners of their convex hull."""
+    points = np.stack([columns, rows], axis=-1).astype(np.int32)
+    return np.ravel(cv2.convexHull(points, returnPoints=False))
+
+
+def _lay_out(
+    mask: np.ndarray,
+    camera: PinholeCamera,
+    T_table_camera: np.ndarray,
+    low: np.ndarray,
+    size: np.ndarray,
+    height: float,
+) -> Bool[np.ndarray, "rows columns"]:
+    """A mask laid onto the plane at a height: x to the right, y up, pixels of `GRID`."""
+    width, length = (int(n) for n in size)
+    x = low[0] + GRID * (np.arange(width) + 0.5)
+    y = low[1] + GRID * (np.arange(length)[::-1] + 0.5)
+    points = np.stack([*np.meshgrid(x, y), np.full((length, width), height)], axis=-1).reshape(-1, 3)
+    pixels = camera.project(points, invert_transform(T_table_camera)).astype(np.float32)
+    columns, rows = pixels.T.reshape(2, length, width)
+    return cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) >= 0.5
+
+
+def _largest(flat: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """The largest patch of a mask, without holes: what `Prism.from_mask` sees."""
+    from foretrace.objects import read_silhouette
+
+    return read_silhouette(flat)
+
+
+def fit_object(mask_object: PlacedObject, obj: ObjectModel) -> PlacedObject:
+    """Where a known object lies whose outline was seen: the turn and shift that make the outlines agree best.
+
+    Raises:
+        PerceptionError: The outline is not the object's, or several turns explain it equally well.
+    """
+    seen = shapely.Polygon(mask_object.outline()[:, :2])
+    known = shapely.Polygon(obj.corners)
+    best: list[tuple[float, np.ndarray]] = []
+    for angle in np.linspace(-np.pi, np.pi, 36, endpoint=False):
+        pose = _refine(seen, obj.corners, angle)
+        overlap = _overlap(seen, obj.corners, pose)
+        best.append((overlap, pose))
+    best.sort(key=lambda entry: -entry[0])
+    overlap, pose = best[0]
+    if overlap < 0.9:
+        raise PerceptionError(
+            f"the outline that is seen overlaps the given object's by {100 * overlap:.0f} % only (areas "
+            f"{1e4 * seen.area:.1f} and {1e4 * known.area:.1f} cm2): check shape, unit and mask"
+        )
+    turns = [abs((other[2] - pose[2] + np.pi) % (2 * np.pi) - np.pi) for _, other in best]
+    twins = [
+        entry for entry, turn in zip(best, turns, strict=True) if turn > 0.2 and entry[0] > overlap - 0.01
+    ]
+    if twins:
+        raise PerceptionError(
+            f"the object fits its outline in several ways (turned by {np.rad2deg(abs(twins[0][1][2] - pose[2])):.0f} "
+            "degrees as well): say where the marker sits on it with object_pose in the marker layout"
+        )
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]]
+    T[:2, 3] = pose[:2]
+    return PlacedObject(obj, T)
+
+
+def _moved(corners: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    return corners @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2]
+
+
+def _overlap(seen: shapely.Polygon, corners: np.ndarray, pose: np.ndarray) -> float:
+    """Intersection over union."""
+    other = shapely.Polygon(_moved(corners, pose))
+    return float(seen.intersection(other).area / seen.union(other).area)
+
+
+def _refine(seen: shapely.Polygon, corners: np.ndarray, angle: float) -> np.ndarray:
+    """x, y and angle near a first angle for which points of one outline lie on the other, by least squares."""
+    from scipy.optimize import least_squares
+
+    ring = shapely.LinearRing(corners)
+    along = np.linspace(0, 1, 80, endpoint=False)
+    points = shapely.get_coordinates(shapely.line_interpolate_point(seen.exterior, along, normalized=True))
+    start = (
+        np.array(seen.centroid.coords[0])
+        - _moved(np.array(shapely.Polygon(corners).centroid.coords), np.array([0.0, 0.0, angle]))[0]
+    )
+
+    def away(pose: np.ndarray) -> np.ndarray:
+        cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+        back = (points - pose[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
+        return np.asarray(shapely.distance(ring, shapely.points(back)))
+
+    return least_squares(away, [*start, angle], loss="soft_l1", f_scale=0.002, max_nfev=40).x
+
+
+def contact_at_pixel(
+    placed: PlacedObject,
+    pixel: tuple[float, float],
+    camera: PinholeCamera,
+    T_table_camera: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "2"]:
+    """The point of a picture as a point in the object frame [m]: it is taken to lie on the upper face's rim.
+
+    Raises:
+        PerceptionError: The line of sight does not meet that plane.
+    """
+    on_top = camera.on_plane(np.array([pixel], dtype=float), T_table_camera, placed.object.height)[0]
+    if not np.isfinite(on_top).all():
+        raise PerceptionError(f"pixel {pixel} looks past the table: give a pixel on the object's upper rim")
+    in_table = np.array([*on_top, 0.0])
+    return transform_points(invert_transform(placed.T_table_object), in_table[None])[0, :2]
+
+
+def see(placed: PlacedObject, contact: Float[np.ndarray, "2"]) -> Sight:
+    """The lever-up at the outline's point nearest to a contact, and the exact view of it.
+
+    Args:
+        placed: The object on the table.
+        contact: Where to lever, in the object frame [m].
+
+    Raises:
+        PerceptionError: The contact lies far from the outline.
+    """
+    action = LeverUp.nearest(placed.object, contact)
+    gap = float(np.linalg.norm(action.contact - contact))
+    if gap > LARGEST_SNAP:
+        x, y = contact
+        raise PerceptionError(
+            f"contact ({x:.3f}, {y:.3f}) m lies {gap:.3f} m from the object's outline: choose a point within "
+            f"{LARGEST_SNAP} m of it"
+        )
+    return Sight(placed, action, TopDownView.of(placed.object, action))
+
+
+def view_of_depth(
+    depth: Float[np.ndarray, "rows columns"],
+    mask: Bool[np.ndarray, "rows columns"],
+    camera: PinholeCamera,
+    T_action_camera: Float[np.ndarray, "4 4"],
+    minimal_height: float = 2 * MINIMAL_HEIGHT,
+) -> TopDownView:
+    """The depth-enriched view (paper, section 5.5): what the mask's pixels see, of any shape, in the action frame.
+
+    Raises:
+        PerceptionError: The pictures do not match the camera.
+        ViewError: No point of the object lies in the window.
+    """
+    camera.check_picture(depth, "depth picture")
+    points = camera.deproject(np.where(mask, depth, 0.0), T_action_camera)
+    return TopDownView.from_points(points, minimal_height)
