@@ -284,7 +284,7 @@ def _write_description(rows: Sequence[dict[str, Any]], layout: Layout, folder: P
     """The data set as a whole: what it holds, its one task, its statistics."""
     info = {
         "codebase_version": CODEBASE_VERSION,
-        "robot_type": "ur10e",
+        "robot_type": "ur10",
         "total_episodes": len(rows),
         "total_frames": rows[-1]["dataset_to_index"],
         "total_tasks": 1,
