@@ -25,6 +25,7 @@ from foretrace.cli.learning import predict, train
 from foretrace.cli.non_flat import evaluate_non_flat
 from foretrace.cli.randomisation import evaluate_randomisation
 from foretrace.cli.reconstruction import evaluate_reconstruction
+from foretrace.cli.recordings import import_recording
 from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.robot import robot
 from foretrace.cli.transfer import evaluate_transfer
@@ -69,6 +70,7 @@ COMMANDS: dict[str, Command | Group] = {
     "describe": describe,
     "doctor": doctor,
     "calibrate": calibrate,
+    "import": import_recording,
     "robot": robot,
 }
 """Every command by its name."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from foretrace.cli.console import say
+from foretrace.cli.recordings import MaskMethod, look_at_photo
 from foretrace.errors import ActionError, PredictionError, ShapeError, TrainingError
 
 if TYPE_CHECKING:
@@ -103,6 +104,14 @@ def predict(
     edge: int | None = None,
     fraction: float = 0.5,
     contact: tuple[float, float] | None = None,
+    photo: Path | None = None,
+    camera: Path | None = None,
+    markers: Path | None = None,
+    contact_px: tuple[float, float] | None = None,
+    mask: MaskMethod = "grabcut",
+    background: Path | None = None,
+    box: tuple[int, int, int, int] | None = None,
+    hull: bool = False,
     friction: float | None = None,
     tool_friction: float | None = None,
     density: float | None = None,
@@ -112,7 +121,8 @@ def predict(
 ) -> None:
     """Predict the motion of an object before it is touched.
 
-    Give the object as --polygon, --image or --mesh, and the contact as --edge or --contact.
+    Give the object as --polygon, --image or --mesh, and the contact as --edge or --contact; or give a --photo of the
+    table and --contact-px.
 
     Args:
         run: Folder of the training.
@@ -125,6 +135,14 @@ def predict(
         fraction: How far along that edge, between 0 and 1.
         contact: Point to lever at instead, in the object's frame [m]; snapped to the outline. An image's frame has
             its origin at the silhouette's centroid, x to the right and y up.
+        photo: Photograph of the object among markers on the table; the prediction is drawn onto it.
+        camera: The camera's JSON file, from `foretrace calibrate`; by default camera.json beside the photograph.
+        markers: Layout of the markers on the table; by default markers.json beside the photograph.
+        contact_px: Column and row in the photograph of the point to lever at, on the object's upper rim.
+        mask: How the object is found in the photograph.
+        background: Photograph of the table without the object, for --mask background.
+        box: Left, top, width and height of a box round the object, for --mask grabcut.
+        hull: Take the convex hull of the outline in the photograph, as the paper does.
         friction: Friction coefficient between object and table, for a predictor that knows it and for --compare.
         tool_friction: Friction coefficient between object and blade, likewise.
         density: Density of the object [kg/m^3], likewise.
@@ -141,7 +159,23 @@ def predict(
     from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
     predictor = load_predictor(run)
-    obj, action, view, com = _object_and_action(polygon, image, scale, mesh, height, edge, fraction, contact)
+    seen = None
+    if photo is not None:
+        if any(value is not None for value in (polygon, image, scale, mesh, edge, contact)):
+            raise PredictionError(
+                "--photo shows the object: leave out the other ways, and --edge and --contact"
+            )
+        seen = look_at_photo(photo, camera, markers, height or 0.02, contact_px, mask, background, box, hull)
+        obj, action, view, com = (
+            seen.sight.placed.object,
+            seen.sight.action,
+            seen.sight.view,
+            seen.sight.com_in_action,
+        )
+    else:
+        obj, action, view, com = _object_and_action(
+            polygon, image, scale, mesh, height, edge, fraction, contact
+        )
     given = {"friction": friction, "tool_friction": tool_friction, "density": density}
     physics = _known_physics(given, predictor.known, compare)
     imagined = predictor.imagine(view, com, {name: physics[name] for name in predictor.known})
@@ -157,6 +191,8 @@ def predict(
     out.mkdir(parents=True, exist_ok=True)
     _write_trajectory(out, run, obj, action, imagined, truth)
     scene_figure(scene).savefig(out / "prediction.png")
+    if seen is not None:
+        seen.save_overlay(out / "overlay.png", imagined.com_trajectory)
     if animation:
         scene_animation(scene, out / "prediction.gif")
     if truth is not None:

@@ -1,0 +1,219 @@
+"""The way from camera to prediction, proved against simulated films: calibrate, see, track, import, predict.
+
+Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 12]
+       [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
+
+Films are made once and kept. Everything after that sees pictures, time stamps and the marker layout alone; the truth
+is opened only to compare.
+"""
+
+import argparse
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from foretrace.actions import LeverUp
+from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle, transform_points
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import ObjectModel, sample_prism
+from foretrace.perception import masks
+from foretrace.perception.calibration import Board, calibrate, read_picture, read_pictures
+from foretrace.perception.films import open_film
+from foretrace.perception.importing import Contact, Imported, import_film
+from foretrace.perception.markers import MarkerLayout, detect_markers
+from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
+from foretrace.perception.views import Sight, contact_at_pixel, place_object, see
+from foretrace.predictor import load_predictor
+from foretrace.simulation.film import FilmConfig, film_board, film_lever_up
+from foretrace.trajectories import mean_distance, warped_distance
+
+HEIGHT = 0.02
+BOARD = Board()
+
+
+def subject(number: int) -> tuple[ObjectModel, LeverUp]:
+    rng = np.random.default_rng([2026, number])
+    obj = sample_prism(rng, 3 + number % 8)
+    return obj, LeverUp.at_edge(obj, int(rng.integers(len(obj.corners))), float(rng.uniform(0.3, 0.7)))
+
+
+def film_config(number: int) -> FilmConfig:
+    rng = np.random.default_rng([4096, number])
+    side = float(rng.choice([-1, 1]))
+    return FilmConfig(
+        depth_every=10, azimuth=side * float(rng.uniform(1.2, 1.9)), slant=float(rng.uniform(0.5, 0.7))
+    )
+
+
+def make_films(root: Path, num: int) -> None:
+    if not (root / "board").is_dir():
+        (root / "board").mkdir(parents=True)
+        for k, picture in enumerate(film_board(BOARD.draw(4000.0), BOARD.size, seed=1)):
+            cv2.imwrite(str(root / "board" / f"{k:02d}.png"), picture)
+    for number in range(num):
+        folder = root / f"{number:02d}"
+        if not (folder / "truth.json").is_file():
+            film_lever_up(*subject(number), folder, film_config(number), seed=number)
+            print(f"filmed {folder}", flush=True)
+
+
+def sight_of(
+    folder: Path, found: Imported, camera: PinholeCamera, pixel: tuple[float, float], how: str
+) -> Sight:
+    """What the first frame alone shows of an object of unknown shape."""
+    frame = next(open_film(folder).frames())
+    if how == "depth":
+        assert frame.depth is not None
+        heights = masks.heights_above_table(frame.depth, camera, found.T_table_camera)
+        mask = masks.pick_object(masks.mask_by_height(heights), pixel)
+        height, rim = masks.object_height(heights, mask), 0.008
+    else:
+        background = read_picture(folder / "background.png")
+        mask = masks.pick_object(masks.mask_by_background(frame.picture, background), pixel)
+        height, rim = HEIGHT, 0.003
+    placed = place_object(mask, camera, found.T_table_camera, height, rim, hull=True)
+    return see(placed, contact_at_pixel(placed, pixel, camera, found.T_table_camera))
+
+
+def overlap(a: TopDownView, b: TopDownView) -> float:
+    return float((a.mask & b.mask).sum() / (a.mask | b.mask).sum())
+
+
+def measure(folder: Path, camera: PinholeCamera, predictor, picture: Path | None) -> dict:
+    truth = json.loads((folder / "truth.json").read_text())
+    number = int(folder.name)
+    obj, action = subject(number)
+    T_truth = pose_to_matrix(np.array(truth["object_poses_in_table"]))
+    contact = Contact(point=(float(action.contact[0]), float(action.contact[1])))
+    found = import_film(open_film(folder), camera, MarkerLayout.load(folder / "markers.json"), contact, obj)
+    position = np.linalg.norm(found.T_table_object[:, :3, 3] - T_truth[:, :3, 3], axis=1)
+    turn = rotation_angle(found.T_table_object[:, :3, :3], T_truth[:, :3, :3])
+    # Somebody points at the contact in the first frame.
+    T_camera_table = invert_transform(found.T_table_camera)
+    rim = transform_points(T_truth[0], np.array([[*action.contact, obj.height]]))
+    column, row = camera.project(rim, T_camera_table)[0]
+    exact = TopDownView.of(obj, action)
+    com = obj.mass_properties(1.0).com
+    com_in_action = transform_points(action.T_action_object, com[None])[0]
+    T_action_table = invert_transform(np.array(truth["T_table_action"]))
+    moved = transform_points(T_action_table @ T_truth, com[None])[:, 0]
+    times = np.array(truth["times"]) - truth["action_start"]
+    result = {
+        "film": number,
+        "corners": len(obj.corners),
+        "outcome": truth["outcome"],
+        "imported_outcome": str(found.interaction.effect.outcome),
+        "frames_seen": float(found.track.seen.mean()),
+        "position_error_mm": {"median": 1e3 * float(np.median(position)), "max": 1e3 * float(position.max())},
+        "rotation_error_deg": {
+            "median": float(np.rad2deg(np.median(turn))),
+            "max": float(np.rad2deg(turn.max())),
+        },
+        "start_error_s": found.start - truth["action_start"],
+    }
+    imagined = predictor.imagine(exact, com_in_action)
+    grid = imagined.times[imagined.times <= times[-1]]
+    path = np.column_stack([np.interp(grid, times, moved[:, i]) for i in range(3)])
+    slip = found.interaction.effect.slip_index
+    end = len(grid) if slip is None else min(slip, len(grid))
+    result["error_exact_cm"] = 100 * float(mean_distance(imagined.com_trajectory[:end], path[:end]))
+    for how in ("background", "depth"):
+        sight = sight_of(folder, found, camera, (float(column), float(row)), how)
+        seen = predictor.imagine(sight.view, sight.com_in_action)
+        # In the table frame: an action frame that was seen askew counts as an error of the prediction.
+        in_table = transform_points(sight.T_table_action, seen.com_trajectory)
+        in_action = transform_points(T_action_table, in_table)
+        result[f"iou_{how}"] = overlap(sight.view, exact)
+        result[f"error_{how}_cm"] = 100 * float(mean_distance(in_action[:end], path[:end]))
+        if how == "background" and picture is not None:
+            save_picture(picture, folder, camera, found, sight, in_table[:end], truth, com)
+    observed = found.interaction.effect.com_trajectory[:end]
+    result["error_imported_dtw_cm"] = 100 * warped_distance(seen.com_trajectory[:end], observed).distance
+    return result
+
+
+def save_picture(
+    out: Path,
+    folder: Path,
+    camera: PinholeCamera,
+    found: Imported,
+    sight: Sight,
+    path: np.ndarray,
+    truth: dict,
+    com,
+) -> None:
+    frames = list(open_film(folder).frames())
+    there = np.isfinite(found.T_table_object[:, 0, 0])
+    until = found.start + found.interaction.effect.times[len(path) - 1]
+    there &= (found.track.times >= found.start) & (found.track.times <= until)
+    observed = transform_points(found.T_table_object[there], com[None])[:, 0]
+    paths = {"predicted": (path, PREDICTED), "observed": (observed, OBSERVED)}
+    layout = MarkerLayout.load(folder / "markers.json")
+    halves = []
+    for frame, outline in (
+        (frames[0], sight.placed.outline(HEIGHT)),
+        (frames[int(np.flatnonzero(there)[-1])], None),
+    ):
+        corners = detect_markers(frame.picture, layout.dictionary).corners
+        halves.append(draw_overlay(frame.picture, camera, found.T_table_camera, outline, paths, corners))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    both = cv2.resize(np.hstack(halves), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(out), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--films", type=Path, default=Path("build/films"))
+    parser.add_argument("--num", type=int, default=12)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    make_films(options.films, options.num)
+    calibration = calibrate(read_pictures([options.films / "board"]), BOARD)
+    predictor = load_predictor(options.run)
+    rows = []
+    for number in range(options.num):
+        picture = options.picture if number == 5 else None
+        rows.append(measure(options.films / f"{number:02d}", calibration.camera, predictor, picture))
+        print(json.dumps(rows[-1]), flush=True)
+    errors = {
+        name: np.array([row[f"error_{name}_cm"] for row in rows]) for name in ("exact", "background", "depth")
+    }
+    summary = {
+        "films": len(rows),
+        "calibration_error_pixels": calibration.error,
+        "position_error_median_mm": float(np.median([row["position_error_mm"]["median"] for row in rows])),
+        "position_error_median_of_worst_film_mm": max(row["position_error_mm"]["median"] for row in rows),
+        "position_error_max_mm": max(row["position_error_mm"]["max"] for row in rows),
+        "rotation_error_median_deg": float(np.median([row["rotation_error_deg"]["median"] for row in rows])),
+        "rotation_error_median_of_worst_film_deg": max(row["rotation_error_deg"]["median"] for row in rows),
+        "rotation_error_max_deg": max(row["rotation_error_deg"]["max"] for row in rows),
+        **{
+            f"iou_{how}_median": float(np.median([row[f"iou_{how}"] for row in rows]))
+            for how in ("background", "depth")
+        },
+        **{f"iou_{how}_min": min(row[f"iou_{how}"] for row in rows) for how in ("background", "depth")},
+        **{f"error_{name}_mean_cm": float(values.mean()) for name, values in errors.items()},
+        **{
+            f"error_ratio_{name}": float(errors[name].mean() / errors["exact"].mean())
+            for name in ("background", "depth")
+        },
+        "outcomes_right": sum(row["outcome"] == row["imported_outcome"] for row in rows),
+        "start_error_median_s": float(np.median(np.abs([row["start_error_s"] for row in rows]))),
+    }
+    print(json.dumps(summary, indent=1))
+    if options.out is not None:
+        content = {
+            "versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__},
+            "run": str(options.run),
+        }
+        options.out.write_text(json.dumps(content | {"summary": summary, "films": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Data sets of recorded interactions, which grow one by one; read by `Dataset.open` like any other."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from foretrace.errors import DatasetError
+from foretrace.interactions import storage
+from foretrace.interactions.record import Interaction
+
+CONFIGURATION = {"source": "recorded"}
+NOTES_FOLDER = "recordings"
+"""Folder with a JSON file for each interaction: its camera, and how well it was seen."""
+
+
+def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any]) -> int:
+    """Adds an interaction to a data set of recordings, which is begun if there is none; returns its id.
+
+    Args:
+        folder: The data set's folder.
+        interaction: What was recorded; it gets the next free id.
+        notes: What is kept beside it, JSON-able.
+
+    Raises:
+        DatasetError: The folder holds something else, or a simulated data set.
+    """
+    if folder.exists() and not (folder / storage.MANIFEST).is_file() and any(folder.iterdir()):
+        raise DatasetError(f"{folder} is no data set and not empty: choose a new folder")
+    (folder / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
+    (folder / NOTES_FOLDER).mkdir(exist_ok=True)
+    with storage.sole_writer(folder):
+        if (folder / storage.MANIFEST).is_file():
+            manifest = storage.read_manifest(folder)
+        else:
+            manifest = storage.new_manifest(CONFIGURATION, 0, 1, interaction.provenance.versions)
+        if manifest["configuration"] != CONFIGURATION:
+            raise DatasetError(
+                f"{folder} holds simulated interactions: keep recordings in a folder of their own"
+            )
+        id = manifest["num_trials"]
+        described = json.dumps(interaction.object.to_dict())
+        known: dict[str, int] = {}
+        for name, entry in manifest["shards"].items():
+            table, _ = storage.read_shard(folder, name, entry.get("sha256"))
+            known |= dict(zip(table["object"].to_pylist(), table["object_id"].to_pylist(), strict=True))
+        object_id = known.get(described, len(set(known.values())))
+        table = storage.to_table([storage.encode(replace(interaction, id=id), object_id)])
+        path = folder / NOTES_FOLDER / f"{id:05d}.json"
+        storage.write_atomically(path, json.dumps(dict(notes), indent=1).encode())
+        name = storage.shard_name(id)
+        manifest["shards"][name] = storage.write_shard(folder, name, table)
+        manifest["num_trials"] = id + 1
+        storage.write_manifest(folder, manifest)
+    return id
