@@ -156,7 +156,7 @@ def errors_figure(summary: Mapping[str, Any]) -> Figure:
     """Errors of both channels by kind of object, one panel for each split."""
     settings = summary["settings"]
     with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(5.6 * len(settings), 4.2), dpi=DPI, layout="constrained")
+        fig = Figure(figsize=(max(7.4, 5.6 * len(settings)), 4.2), dpi=DPI, layout="constrained")
         panels = fig.subplots(1, len(settings), squeeze=False, sharey=True)[0]
         for ax, (setting, found) in zip(panels, settings.items(), strict=True):
             _draw_groups(ax, found["groups"])
@@ -172,7 +172,7 @@ def errors_figure(summary: Mapping[str, Any]) -> Figure:
             Line2D([], [], color=INK, marker="D", linestyle="none", label="paper, its own objects")
         )
         fig.legend(handles=handles, loc="outside lower center", ncols=3)
-        note = "Im-CNN trained on the same lever-ups; bars: means over the seeds and their 95 % bootstrap intervals"
+        note = "Im-CNN, the same lever-ups; means over the seeds, with 95 % bootstrap intervals if several"
         finish(fig, "What the height map adds to the mask", note)
     return fig
 
