@@ -1,6 +1,6 @@
 """The way from camera to prediction, proved against simulated films: calibrate, see, track, import, predict.
 
-Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 12]
+Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 10]
        [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
 
 Films are made once and kept. Everything after that sees pictures, time stamps and the marker layout alone; the truth
@@ -45,7 +45,7 @@ def film_config(number: int) -> FilmConfig:
     rng = np.random.default_rng([4096, number])
     side = float(rng.choice([-1, 1]))
     return FilmConfig(
-        depth_every=10, azimuth=side * float(rng.uniform(1.2, 1.9)), slant=float(rng.uniform(0.5, 0.7))
+        depth_every=10, azimuth=side * float(rng.uniform(0.5, 1.3)), slant=float(rng.uniform(0.5, 0.7))
     )
 
 
@@ -148,7 +148,8 @@ def save_picture(
 ) -> None:
     frames = list(open_film(folder).frames())
     there = np.isfinite(found.T_table_object[:, 0, 0])
-    until = found.start + found.interaction.effect.times[len(path) - 1]
+    effect = found.interaction.effect
+    until = found.start + effect.times[min(len(path), len(effect.times)) - 1]
     there &= (found.track.times >= found.start) & (found.track.times <= until)
     observed = transform_points(found.T_table_object[there], com[None])[:, 0]
     paths = {"predicted": (path, PREDICTED), "observed": (observed, OBSERVED)}
@@ -169,7 +170,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--films", type=Path, default=Path("build/films"))
-    parser.add_argument("--num", type=int, default=12)
+    parser.add_argument("--num", type=int, default=10)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()

@@ -40,6 +40,8 @@ BLURRED = 15.0
 """A picture whose Laplacian varies by less than this has no sharp edge (grey values squared)."""
 SMALLEST_SIDE = 10.0
 """A marker of fewer pixels along its shortest side tells no pose."""
+LEAST_SLANT = np.deg2rad(15.0)
+"""A marker that is looked at more flatly than this tells no pose: its two poses look alike, and its pattern blurs [rad]."""
 
 CELL = 16
 """Pixels along a module of the pattern that is drawn."""
@@ -272,7 +274,9 @@ class MarkerBody:
                     *cv2.solvePnPRefineLM(points, pixels, matrix, coefficients, rotation, T[:3, 3:].copy())
                 )
             error = np.linalg.norm(camera.project(points, T) - pixels, axis=1)
-            if np.isfinite(error).all():
+            seen_from = invert_transform(T @ self.placements[largest])[:3, 3]
+            slant = np.arcsin(seen_from[2] / np.linalg.norm(seen_from))
+            if np.isfinite(error).all() and slant > LEAST_SLANT:
                 found.append(PoseCandidate(T, float(np.sqrt((error**2).mean()))))
         return sorted(found, key=lambda candidate: candidate.error)
 

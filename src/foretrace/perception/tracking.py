@@ -135,7 +135,10 @@ def track(
     for k in indices:
         points, pixels = matches[k]
         errors[k] = np.sqrt(((camera.project(points, poses[k]) - pixels) ** 2).sum(axis=1).mean())
-    return Track(times, poses, seen, errors, covariance, float(np.median(noise)))
+    # What the smooth path does not explain after all was something else.
+    strange = errors > config.largest_error
+    poses[strange], covariance[strange] = np.nan, np.nan
+    return Track(times, poses, seen & ~strange, errors, covariance, float(np.median(noise)))
 
 
 def check_times(times: Float[np.ndarray, " frame"]) -> None:

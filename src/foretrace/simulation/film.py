@@ -53,12 +53,15 @@ class FilmConfig:
     """From the camera to the point on the table that it looks at, before the contact point [m]."""
     slant: float = 0.6
     """Angle of its line of sight from the vertical [rad]."""
-    azimuth: float = 1.4
-    """Where it stands about that point, from the action's direction towards its left [rad]."""
+    azimuth: float = 1.0
+    """Where it stands about that point, from the action's direction towards its left [rad]: ahead of the object, whose
+    upper face turns that way."""
     frames_per_second: float = 30.0
     """Frames per second."""
     lead_time: float = 0.4
     """Time filmed before the blade's path starts [s]."""
+    tail_time: float = 0.1
+    """Time filmed after its end [s]."""
     exposures: int = 2
     """Moments within a hundredth of a second that are blended into one frame: motion blur."""
     depth_every: int = 1
@@ -144,7 +147,8 @@ def film_lever_up(
     T_action_table = _add_markers(spec, obj, T_object_marker, side, config, rng)
     T_table_action = invert_transform(T_action_table)
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
-    count = round((config.lead_time + simulation.path.duration) * config.frames_per_second)
+    duration = config.lead_time + simulation.path.duration + config.tail_time
+    count = round(duration * config.frames_per_second)
     times = action_start - config.lead_time + np.arange(count) / config.frames_per_second
     poses = _interpolate(motion, times - action_start)[0]
     with LensCamera(spec, config.camera, T_action_camera) as lens:
