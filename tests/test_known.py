@@ -87,7 +87,7 @@ def test_knowing_helps_where_it_decides(batch):
     split = split_by_seed(40, 0, None)
     errors = {}
     for known in ((), ("friction",)):
-        config = replace(CONFIG, known=known, hidden=32, epochs=60)
+        config = replace(CONFIG, known=known, hidden=32, epochs=40)
         predictor, _ = fit_predictor(batch, config, split)
         inputs = predictor.features.inputs(batch)
         errors[known] = measure_errors(predictor, batch[split.train], inputs[split.train])["full"]

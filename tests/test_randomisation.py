@@ -168,16 +168,17 @@ def test_what_was_drawn_is_recorded(varied):
 
 
 def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
-    figures = describe_dataset(Dataset.open(varied))
+    file = tmp_path / "figures.json"
+    assert main(["describe", str(varied), "--out", str(file)]) == 0
+    assert "tool friction" in capsys.readouterr().out
+    figures = json.loads(file.read_text())
     expected = {*storage.PHYSICS_COLUMNS[:3], "height", "bevel_width", "bevel_height", *LARGEST}
     assert figures["varies"].keys() == expected
     low, high = figures["varies"]["height"]
     assert 0.015 <= low < 0.016 < 0.024 < high <= 0.025
-    assert main(["describe", str(varied)]) == 0
-    assert "tool friction" in capsys.readouterr().out
     assert examine(varied).findings == ()
     collect(PLAIN, tmp_path / "plain", workers=1, console=Console(quiet=True), simulate=fake_trial)
-    assert describe_dataset(Dataset.open(tmp_path / "plain")[:20])["varies"] == {}
+    assert describe_dataset(Dataset.open(tmp_path / "plain")[:5])["varies"] == {}
     manifest = storage.read_manifest(varied)
     for name in manifest["shards"]:
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -144,7 +144,7 @@ def test_results_are_the_same_again_and_only_what_is_missing_is_done(
 
 
 def test_who_knows_is_told_the_stand_ins_constants_or_the_usual_ones(shown, monkeypatch):
-    predictor = TrainConfig("none", hidden=8, known=NAMES).make_predictor(60)
+    predictor = TrainConfig(features="none", hidden=8, known=NAMES).make_predictor(60)
     seen = []
 
     def imagine(self, batch, start="observed"):
