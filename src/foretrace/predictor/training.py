@@ -44,9 +44,6 @@ from foretrace.trajectories import final_distance, mean_distance
 class TrainConfig:
     """Settings of a training; the defaults are the paper's where the paper says (section 4)."""
 
-    predictor: str = "lstm"
-    """What kind of predictor: a label of PREDICTORS. ``one-shot`` needs the features ``outline``, always predicts
-    poses, and of the settings of networks looks at ``hidden`` alone."""
     features: str = "im-cnn"
     """What the predictor knows about the object: a label of FEATURES."""
     feature_options: dict[str, Option] = field(default_factory=dict)
@@ -83,6 +80,9 @@ class TrainConfig:
     """Number format of the convolutions in training; ``auto`` takes what the device multiplies fastest."""
     threads: int | None = None
     """Threads of PyTorch on the CPU; None leaves its choice. More than the idle cores make it slower."""
+    predictor: str = "lstm"
+    """What kind of predictor: a label of PREDICTORS. ``one-shot`` needs the features ``outline``, always predicts
+    poses, and of the settings of networks looks at ``hidden`` alone."""
 
     def __post_init__(self) -> None:
         for name in ("steps_ahead", "hidden", "window", "epochs", "min_steps", "batch_size"):
