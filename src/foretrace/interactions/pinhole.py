@@ -85,7 +85,7 @@ class PinholeCamera:
 
     def rays(self, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 3"]:
         """Directions of sight in the camera frame, of length 1 along z."""
-        if not self.distortion:
+        if not self.distortion or len(pixels) == 0:
             plane = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
         else:
             stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)

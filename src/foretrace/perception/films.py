@@ -112,11 +112,10 @@ def _video_frames(path: Path) -> Iterator[Frame]:
     stated, count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0
     try:
         while True:
-            time = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
             there, picture = video.read()
             if not there:
                 break
-            yield Frame(float(time), picture)
+            yield Frame(video.get(cv2.CAP_PROP_POS_MSEC) / 1000, picture)  # of the frame just read
             count += 1
     finally:
         video.release()

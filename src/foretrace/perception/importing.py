@@ -342,8 +342,8 @@ def _record(
     for begin, end in followed.gaps():
         if end >= start and begin <= start + grid[-1]:
             raise PerceptionError(
-                f"the object's markers are out of sight from {begin:.2f} to {end:.2f} s, longer than the "
-                f"{config.track.largest_gap} s that are bridged: film again without covering them"
+                f"the object's markers are not seen from {begin:.2f} to {end:.2f} s, longer than the "
+                f"{config.track.largest_gap} s that are bridged: covered, or seen too flatly; film again from elsewhere"
             )
     T_action_table = invert_transform(sight.T_table_action)
     there = np.isfinite(T_table_object[:, 0, 0])

@@ -41,7 +41,7 @@ BLURRED = 15.0
 SMALLEST_SIDE = 10.0
 """A marker of fewer pixels along its shortest side tells no pose."""
 LEAST_SLANT = np.deg2rad(15.0)
-"""A marker that is looked at more flatly than this tells no pose: its two poses look alike, and its pattern blurs [rad]."""
+"""A marker that is looked at more flatly than this tells no pose: its two poses look alike, its pattern blurs [rad]."""
 
 CELL = 16
 """Pixels along a module of the pattern that is drawn."""

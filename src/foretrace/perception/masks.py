@@ -29,7 +29,7 @@ LEAST_PLANE = 0.3
 
 def mask_by_background(
     picture: UInt8[np.ndarray, "rows columns 3"],
-    background: UInt8[np.ndarray, "rows columns 3"],
+    background: UInt8[np.ndarray, "other_rows other_columns 3"],
     least_change: float = LEAST_CHANGE,
 ) -> Bool[np.ndarray, "rows columns"]:
     """Pixels that differ from a picture of the same place without the object.

@@ -158,12 +158,12 @@ def fit_object(mask_object: PlacedObject, obj: ObjectModel) -> PlacedObject:
     """
     seen = shapely.Polygon(mask_object.outline()[:, :2])
     known = shapely.Polygon(obj.corners)
-    best: list[tuple[float, np.ndarray]] = []
-    for angle in np.linspace(-np.pi, np.pi, 36, endpoint=False):
-        pose = _refine(seen, obj.corners, angle)
-        overlap = _overlap(seen, obj.corners, pose)
-        best.append((overlap, pose))
-    best.sort(key=lambda entry: -entry[0])
+    starts = [_start(seen, known, angle) for angle in np.linspace(-np.pi, np.pi, 36, endpoint=False)]
+    starts.sort(key=lambda pose: -_overlap(seen, obj.corners, pose))
+    refined = [_refine(seen, obj.corners, pose) for pose in starts[:8]]
+    best = sorted(
+        ((_overlap(seen, obj.corners, pose), pose) for pose in refined), key=lambda entry: -entry[0]
+    )
     overlap, pose = best[0]
     if overlap < 0.9:
         raise PerceptionError(
@@ -196,24 +196,26 @@ def _overlap(seen: shapely.Polygon, corners: np.ndarray, pose: np.ndarray) -> fl
     return float(seen.intersection(other).area / seen.union(other).area)
 
 
-def _refine(seen: shapely.Polygon, corners: np.ndarray, angle: float) -> np.ndarray:
-    """x, y and angle near a first angle for which points of one outline lie on the other, by least squares."""
+def _start(seen: shapely.Polygon, known: shapely.Polygon, angle: float) -> np.ndarray:
+    """x, y and angle that put one centroid onto the other."""
+    turned = _moved(np.array(known.centroid.coords), np.array([0.0, 0.0, angle]))[0]
+    return np.array([*(np.array(seen.centroid.coords[0]) - turned), angle])
+
+
+def _refine(seen: shapely.Polygon, corners: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """x, y and angle near a start for which points of one outline lie on the other, by least squares."""
     from scipy.optimize import least_squares
 
     ring = shapely.LinearRing(corners)
     along = np.linspace(0, 1, 80, endpoint=False)
     points = shapely.get_coordinates(shapely.line_interpolate_point(seen.exterior, along, normalized=True))
-    start = (
-        np.array(seen.centroid.coords[0])
-        - _moved(np.array(shapely.Polygon(corners).centroid.coords), np.array([0.0, 0.0, angle]))[0]
-    )
 
     def away(pose: np.ndarray) -> np.ndarray:
         cosine, sine = np.cos(pose[2]), np.sin(pose[2])
         back = (points - pose[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
         return np.asarray(shapely.distance(ring, shapely.points(back)))
 
-    return least_squares(away, [*start, angle], loss="soft_l1", f_scale=0.002, max_nfev=40).x
+    return least_squares(away, start, loss="soft_l1", f_scale=0.002, max_nfev=40).x
 
 
 def contact_at_pixel(

@@ -1,0 +1,324 @@
+"""A filmed lever-up becomes an interaction, from a folder, a video or a bag; broken films are refused with a reason."""
+
+import csv
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from foretrace.actions import LeverUp
+from foretrace.cli import main
+from foretrace.errors import DatasetError, PerceptionError, SimulationError
+from foretrace.geometry import rotation_angle
+from foretrace.interactions import storage
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.doctor import examine
+from foretrace.interactions.outcomes import judge_motion
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.record import Outcome
+from foretrace.interactions.recorded import add_recorded
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import Prism
+from foretrace.perception.films import open_film
+from foretrace.perception.importing import Contact, Imported, import_film
+from foretrace.perception.markers import MarkerLayout
+from foretrace.simulation.film import FilmConfig, FilmTruth, film_lever_up
+from foretrace.simulation.lens import Faults
+
+CAMERA = PinholeCamera(800, 450, 580.0, 581.0, 402.0, 223.0, (0.05, -0.1, 0.0005, -0.0005, 0.02))
+PRISM = Prism([(0.09, -0.02), (0.05, 0.07), (-0.03, 0.08), (-0.09, 0.0), (-0.02, -0.08)])
+ACTION = LeverUp.at_edge(PRISM, 2, 0.5)
+CONTACT = Contact(point=(float(ACTION.contact[0]), float(ACTION.contact[1])))
+CONFIG = FilmConfig(
+    CAMERA, distance=0.6, frames_per_second=10.0, exposures=1, depth_every=40, faults=Faults(blur=0.5)
+)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FilmTruth]:
+    folder = tmp_path_factory.mktemp("films") / "film"
+    try:
+        truth = film_lever_up(PRISM, ACTION, folder, CONFIG, seed=3)
+    except SimulationError as error:
+        pytest.skip(str(error))
+    CAMERA.save(folder / "camera.json")
+    (folder / "object.json").write_text(json.dumps(PRISM.to_dict()))
+    return folder, truth
+
+
+@pytest.fixture(scope="module")
+def imported(film: tuple[Path, FilmTruth]) -> Imported:
+    folder, _ = film
+    return import_film(open_film(folder), CAMERA, MarkerLayout.load(folder / "markers.json"), CONTACT, PRISM)
+
+
+def some_of(folder: Path, new: Path, **changes: object) -> Path:
+    """A copy of a film without its pictures' names changed; ``frames`` keeps the first so many."""
+    shutil.copytree(folder, new)
+    rows = list(csv.reader((new / "timestamps.csv").read_text().splitlines()))
+    rows = rows[: 1 + int(str(changes.get("frames", 10)))]
+    with open(new / "timestamps.csv", "w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    return new
+
+
+def look(folder: Path, camera: PinholeCamera = CAMERA) -> Imported:
+    return import_film(open_film(folder), camera, MarkerLayout.load(folder / "markers.json"), CONTACT, PRISM)
+
+
+def test_the_object_is_where_it_was(film: tuple[Path, FilmTruth], imported: Imported) -> None:
+    _, truth = film
+    apart = np.linalg.norm(imported.T_table_object[:, :3, 3] - truth.T_table_object[:, :3, 3], axis=1)
+    angle = rotation_angle(imported.T_table_object[:, :3, :3], truth.T_table_object[:, :3, :3])
+    assert np.median(apart) < 0.001
+    assert np.median(angle) < np.deg2rad(1.0)
+    assert imported.track.seen.mean() > 0.9
+    np.testing.assert_allclose(imported.T_table_camera[:3, 3], truth.T_table_camera[:3, 3], atol=0.002)
+
+
+def test_the_interaction_is_that_of_the_simulation(film: tuple[Path, FilmTruth], imported: Imported) -> None:
+    _, truth = film
+    found, exact = imported.interaction, truth.interaction
+    assert found.provenance.source == "recorded"
+    assert found.effect.outcome == exact.effect.outcome == Outcome.LEVERED
+    assert imported.start == pytest.approx(truth.action_start, abs=0.05)
+    end = len(found.effect.times)
+    assert end >= 58
+    error = np.linalg.norm(found.effect.com_trajectory - exact.effect.com_trajectory[:end], axis=1)
+    assert np.median(error) < 0.003
+    overlap = (found.view.mask & exact.view.mask).sum() / (found.view.mask | exact.view.mask).sum()
+    assert overlap > 0.98
+
+
+def test_recordings_are_data_like_any_other(
+    film: tuple[Path, FilmTruth], imported: Imported, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = film
+    out = tmp_path / "data"
+    command = [
+        "import",
+        str(folder),
+        "--out",
+        str(out),
+        "--object",
+        str(folder / "object.json"),
+        "--edge",
+        "2",
+    ]
+    assert main(command) == 0
+    assert "interaction 0: levered" in capsys.readouterr().out
+    assert add_recorded(out, imported.interaction, {"camera": "the same"}) == 1
+    dataset = Dataset.open(out)
+    assert len(dataset) == 2
+    assert dataset.table["object_id"].to_pylist() == [0, 0]
+    assert not examine(out).findings
+    assert np.isfinite(dataset.batch().com).all()
+    notes = json.loads((out / "recordings" / "00000.json").read_text())
+    assert PinholeCamera.from_dict(notes["camera"]) == CAMERA
+    assert len(notes["seen"]) == len(notes["frame_times"]) == len(notes["position_deviation_m"])
+    with pytest.raises(DatasetError, match="is no data set"):
+        add_recorded(folder, imported.interaction, {})
+    (tmp_path / "simulated").mkdir()
+    storage.write_manifest(tmp_path / "simulated", storage.new_manifest({"seed": 0}, 0, 100, {}))
+    with pytest.raises(DatasetError, match="holds simulated interactions"):
+        add_recorded(tmp_path / "simulated", imported.interaction, {})
+
+
+def test_an_unknown_object_is_taken_from_its_outline(film: tuple[Path, FilmTruth]) -> None:
+    folder, truth = film
+    rim = truth.T_table_object[0] @ [*ACTION.contact, PRISM.height, 1.0]
+    pixel = CAMERA.project(rim[None, :3], np.linalg.inv(truth.T_table_camera))[0]
+    found = import_film(
+        open_film(folder),
+        CAMERA,
+        MarkerLayout.load(folder / "markers.json"),
+        Contact(pixel=(float(pixel[0]), float(pixel[1]))),
+    )
+    exact = TopDownView.of(PRISM, ACTION)
+    view = found.interaction.view
+    assert (view.mask & exact.mask).sum() / (view.mask | exact.mask).sum() > 0.97
+    assert found.interaction.object.height == pytest.approx(PRISM.height, abs=0.002)
+
+
+def test_broken_films_are_refused_with_a_reason(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
+    folder, _ = film
+    short = some_of(folder, tmp_path / "short", frames=8)
+    with pytest.raises(PerceptionError, match="never moves by a millimetre"):
+        look(short)
+    with pytest.raises(PerceptionError, match="800 x 450 pixels, the camera was calibrated for 640 x 360"):
+        look(short, PinholeCamera(640, 360, 460.0, 460.0, 320.0, 180.0))
+    table = short / "timestamps.csv"
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([*lines[:4], lines[5], lines[4], *lines[6:]]))
+    with pytest.raises(PerceptionError, match="do not increase: frame 4"):
+        look(short)
+    table.write_text("\n".join([lines[0], *(line.replace("colour-00002", "gone") for line in lines[1:])]))
+    with pytest.raises(PerceptionError, match="cannot read a picture"):
+        look(short)
+    table.write_text("time\n1")
+    with pytest.raises(PerceptionError, match="its columns are time_s, colour, depth"):
+        look(short)
+    with pytest.raises(PerceptionError, match="no recording at"):
+        open_film(tmp_path / "nothing")
+    with pytest.raises(PerceptionError, match="is no recording that can be read"):
+        open_film(folder / "markers.json")
+
+
+def test_why_no_marker_is_found(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
+    folder, _ = film
+    few = some_of(folder, tmp_path / "few", frames=3)
+    layout = json.loads((few / "markers.json").read_text())
+    (few / "markers.json").write_text(json.dumps(layout | {"dictionary": "4x4_50"}))
+    with pytest.raises(PerceptionError, match="has markers of apriltag_36h11"):
+        look(few)
+    (few / "markers.json").write_text(json.dumps(layout | {"object": [{"id": 77, "side": 0.04}]}))
+    with pytest.raises(PerceptionError, match=r"markers \[77\] are seen in 0 of 3 frames.*seen are \["):
+        look(few)
+    (few / "markers.json").write_text(json.dumps(layout))
+    for name, spoil, reason in (
+        ("dark", lambda picture: picture // 20, "it is dark"),
+        ("blurred", lambda picture: cv2.GaussianBlur(picture, (0, 0), 12), "it is blurred"),
+        ("empty", lambda picture: np.full_like(picture, 200), "it is blurred or empty"),
+    ):
+        copy = tmp_path / name
+        shutil.copytree(few, copy)
+        for path in list(copy.glob("colour-*.jpg"))[:]:
+            cv2.imwrite(str(path), spoil(cv2.imread(str(path))))
+        with pytest.raises(PerceptionError, match=reason):
+            look(copy)
+
+
+def test_wrong_sides_and_gaps_are_noticed(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
+    folder, _ = film
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    layout = json.loads((copy / "markers.json").read_text())
+    layout["object"][0]["side"] *= 1.4
+    (copy / "markers.json").write_text(json.dumps(layout))
+    with pytest.raises(PerceptionError, match="check the sides of the markers"):
+        look(copy)
+    shutil.copy(folder / "markers.json", copy)
+    for number in range(15, 22):
+        cv2.imwrite(str(copy / f"colour-{number:05d}.jpg"), np.full((450, 800, 3), 200, np.uint8))
+    with pytest.raises(PerceptionError, match=r"are not seen from .* longer than the 0.25 s"):
+        look(copy)
+
+
+def test_videos(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
+    folder, _ = film
+    path = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (800, 450))
+    pictures = [frame.picture for frame in open_film(folder).frames()][:12]
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    frames = list(open_film(path).frames())
+    np.testing.assert_allclose([frame.time for frame in frames], 0.1 * np.arange(12), atol=1e-3)
+    assert np.abs(frames[3].picture.astype(int) - pictures[3]).mean() < 5
+    content = path.read_bytes()
+    (tmp_path / "half.avi").write_bytes(content[: len(content) // 2])
+    with pytest.raises(PerceptionError, match=r"is cut off|cannot be opened"):
+        list(open_film(tmp_path / "half.avi").frames())
+    (tmp_path / "none.mp4").write_bytes(b"no video")
+    with pytest.raises(PerceptionError, match="cannot be opened"):
+        list(open_film(tmp_path / "none.mp4").frames())
+
+
+def write_bag(path: Path, frames: list[tuple[float, np.ndarray]], ros1: bool) -> None:
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    types_of = store.types
+    extra = {"seq": 0} if ros1 else {}
+    letters = "DKRP" if ros1 else "dkrp"
+    stamp_type = types_of["builtin_interfaces/msg/Time"]
+    writer = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    with writer:
+        image = writer.add_connection("/camera/color/image_raw", "sensor_msgs/msg/Image", typestore=store)
+        info = writer.add_connection(
+            "/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", typestore=store
+        )
+        for time, picture in frames:
+            stamp = stamp_type(sec=int(time), nanosec=round(1e9 * (time % 1)))
+            header = types_of["std_msgs/msg/Header"](stamp=stamp, frame_id="camera", **extra)
+            rows, columns = picture.shape[:2]
+            rgb = np.ascontiguousarray(picture[..., ::-1]).ravel()
+            message = types_of["sensor_msgs/msg/Image"](
+                header=header,
+                height=rows,
+                width=columns,
+                encoding="rgb8",
+                is_bigendian=0,
+                step=3 * columns,
+                data=rgb,
+            )
+            region = types_of["sensor_msgs/msg/RegionOfInterest"](
+                x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            )
+            numbers = (np.array(CAMERA.distortion), CAMERA.matrix.ravel(), np.eye(3).ravel(), np.zeros(12))
+            camera = types_of["sensor_msgs/msg/CameraInfo"](
+                header=header,
+                height=rows,
+                width=columns,
+                distortion_model="plumb_bob",
+                binning_x=0,
+                binning_y=0,
+                roi=region,
+                **dict(zip(letters, numbers, strict=True)),
+            )
+            serialise = store.serialize_ros1 if ros1 else store.serialize_cdr
+            for connection, content in ((image, message), (info, camera)):
+                writer.write(connection, round(1e9 * time), serialise(content, content.__msgtype__))
+
+
+@pytest.mark.parametrize("ros1", [True, False], ids=["ros1", "ros2"])
+def test_bags(film: tuple[Path, FilmTruth], tmp_path: Path, ros1: bool) -> None:
+    pytest.importorskip("rosbags")
+    folder, truth = film
+    frames = [(frame.time, frame.picture) for frame in open_film(folder).frames()][:6]
+    path = tmp_path / ("film.bag" if ros1 else "film")
+    write_bag(path, frames, ros1)
+    bag = open_film(path)
+    assert bag.camera == CAMERA
+    read = list(bag.frames())
+    np.testing.assert_allclose([frame.time for frame in read], truth.times[:6], atol=1e-6)
+    np.testing.assert_array_equal(read[2].picture, frames[2][1])
+    with pytest.raises(PerceptionError, match="image topics are /camera/color/image_raw"):
+        open_film(path, "/other")
+    content = next(iter(path.glob("*.mcap"))) if path.is_dir() else path
+    content.write_bytes(content.read_bytes()[: content.stat().st_size // 2])
+    with pytest.raises(PerceptionError, match="cannot be read"):
+        list(open_film(path).frames())
+
+
+def test_an_action_is_said_once() -> None:
+    with pytest.raises(PerceptionError, match="exactly one"):
+        Contact()
+    with pytest.raises(PerceptionError, match="exactly one"):
+        Contact(point=(0.0, 0.0), edge=(1, 0.5))
+
+
+def test_outcomes_from_motion_alone_agree_with_those_that_saw_the_blade(film: tuple[Path, FilmTruth]) -> None:
+    effect = film[1].interaction.effect
+    assert judge_motion(PRISM, effect.pose_trajectory, effect.com_trajectory) == (Outcome.LEVERED, None)
+    dropped = effect.pose_trajectory.copy()
+    dropped[40:] = dropped[0]
+    com = effect.com_trajectory.copy()
+    com[40:] = com[0]
+    assert judge_motion(PRISM, dropped, com) == (Outcome.SLIPPED, 40)
+    still = np.repeat(dropped[:1], 60, axis=0)
+    assert judge_motion(PRISM, still, np.repeat(com[:1], 60, axis=0)) == (Outcome.MISSED, None)
+
+
+def test_only_mujoco_films() -> None:
+    simulation = dataclasses.replace(CONFIG.simulation)
+    assert simulation.engine == "mujoco"
+    with pytest.raises(SimulationError, match="at least 1 exposure"):
+        FilmConfig(exposures=0)
