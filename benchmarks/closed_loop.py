@@ -1,6 +1,6 @@
 """The way from camera to prediction, proved against simulated films: calibrate, see, track, import, predict.
 
-Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 10]
+Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 10] [--data data/paper]
        [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
 
 Films are made once and kept. Everything after that sees pictures, time stamps and the marker layout alone; the truth
@@ -17,13 +17,15 @@ import numpy as np
 
 from foretrace.actions import LeverUp
 from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle, transform_points
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
 from foretrace.perception import masks
 from foretrace.perception.calibration import Board, calibrate, read_picture, read_pictures
 from foretrace.perception.films import open_film
-from foretrace.perception.importing import Contact, Imported, import_film
+from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_film
 from foretrace.perception.markers import MarkerLayout, detect_markers
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
 from foretrace.perception.views import Sight, contact_at_pixel, place_object, see
@@ -166,6 +168,26 @@ def save_picture(
     cv2.imwrite(str(out), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
+def judge_simulated(data: Path) -> dict:
+    """Outcomes told from motion alone against those that saw the blade, and when objects begin to move."""
+    dataset, agree, onsets = Dataset.open(data), 0, []
+    chosen = range(0, len(dataset), 2)
+    for row in chosen:
+        interaction = dataset[row]
+        effect = interaction.effect
+        told, _ = judge_motion(interaction.object, effect.pose_trajectory, effect.com_trajectory)
+        agree += told == effect.outcome
+        shift = np.linalg.norm(effect.com_trajectory - effect.com_trajectory[0], axis=1)
+        k = int((shift > ONSET_SHIFT).argmax())
+        onsets.append(np.interp(ONSET_SHIFT, shift[k - 1 : k + 1], effect.times[k - 1 : k + 1]))
+    return {
+        "interactions": len(chosen),
+        "outcomes_agree": int(agree),
+        "onset_median_s": float(np.median(onsets)),
+        "onset_deviation_s": float(np.std(onsets)),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--run", type=Path, required=True)
@@ -173,6 +195,9 @@ def main() -> None:
     parser.add_argument("--num", type=int, default=10)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--picture", type=Path)
+    parser.add_argument(
+        "--data", type=Path, help="simulated data set on which judging from motion is checked"
+    )
     options = parser.parse_args()
     make_films(options.films, options.num)
     calibration = calibrate(read_pictures([options.films / "board"]), BOARD)
@@ -207,13 +232,16 @@ def main() -> None:
         "outcomes_right": sum(row["outcome"] == row["imported_outcome"] for row in rows),
         "start_error_median_s": float(np.median(np.abs([row["start_error_s"] for row in rows]))),
     }
-    print(json.dumps(summary, indent=1))
+    judged = None if options.data is None else judge_simulated(options.data)
+    print(json.dumps({"summary": summary, "judging": judged}, indent=1))
     if options.out is not None:
         content = {
             "versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__},
             "run": str(options.run),
         }
-        options.out.write_text(json.dumps(content | {"summary": summary, "films": rows}, indent=1) + "\n")
+        options.out.write_text(
+            json.dumps(content | {"summary": summary, "judging": judged, "films": rows}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":
