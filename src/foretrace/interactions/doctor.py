@@ -138,7 +138,7 @@ def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Findin
     for column, drawn in (manifest["configuration"].get("randomisation") or {}).items():
         if column not in table.column_names or drawn is None:
             continue
-        low, high = (-drawn, drawn) if np.isscalar(drawn) else drawn
+        low, high = (-drawn, drawn) if isinstance(drawn, int | float) else drawn
         values = table[column].to_numpy()
         for row in np.flatnonzero((values < low) | (values > high)):
             who = f"interaction {table['id'][int(row)]}"
