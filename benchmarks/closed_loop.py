@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from foretrace.actions import LeverUp
+from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle, transform_points
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.outcomes import judge_motion
@@ -202,16 +203,22 @@ def main() -> None:
     make_films(options.films, options.num)
     calibration = calibrate(read_pictures([options.films / "board"]), BOARD)
     predictor = load_predictor(options.run)
-    rows = []
+    rows, refused = [], {}
     for number in range(options.num):
         picture = options.picture if number == 5 else None
-        rows.append(measure(options.films / f"{number:02d}", calibration.camera, predictor, picture))
+        try:
+            rows.append(measure(options.films / f"{number:02d}", calibration.camera, predictor, picture))
+        except PerceptionError as error:
+            refused[number] = str(error)
+            print(f"film {number} is refused: {error}", flush=True)
+            continue
         print(json.dumps(rows[-1]), flush=True)
     errors = {
         name: np.array([row[f"error_{name}_cm"] for row in rows]) for name in ("exact", "background", "depth")
     }
     summary = {
-        "films": len(rows),
+        "films": options.num,
+        "films_refused": len(refused),
         "calibration_error_pixels": calibration.error,
         "position_error_median_mm": float(np.median([row["position_error_mm"]["median"] for row in rows])),
         "position_error_median_of_worst_film_mm": max(row["position_error_mm"]["median"] for row in rows),
@@ -240,7 +247,10 @@ def main() -> None:
             "run": str(options.run),
         }
         options.out.write_text(
-            json.dumps(content | {"summary": summary, "judging": judged, "films": rows}, indent=1) + "\n"
+            json.dumps(
+                content | {"summary": summary, "judging": judged, "films": rows, "refused": refused}, indent=1
+            )
+            + "\n"
         )
 
 
