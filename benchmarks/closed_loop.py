@@ -155,7 +155,7 @@ def save_picture(
     until = found.start + effect.times[min(len(path), len(effect.times)) - 1]
     there &= (found.track.times >= found.start) & (found.track.times <= until)
     observed = transform_points(found.T_table_object[there], com[None])[:, 0]
-    paths = {"predicted": (path, PREDICTED), "observed": (observed, OBSERVED)}
+    paths = {"observed": (observed, OBSERVED), "predicted": (path, PREDICTED)}
     layout = MarkerLayout.load(folder / "markers.json")
     halves = []
     for frame, outline in (
@@ -163,10 +163,26 @@ def save_picture(
         (frames[int(np.flatnonzero(there)[-1])], None),
     ):
         corners = detect_markers(frame.picture, layout.dictionary).corners
-        halves.append(draw_overlay(frame.picture, camera, found.T_table_camera, outline, paths, corners))
+        # Drawn large: the paths are a few centimetres long.
+        large = cv2.resize(frame.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        drawn = draw_overlay(large, enlarged(camera), found.T_table_camera, outline, paths, 2 * corners + 0.5)
+        halves.append(drawn[: 2 * 600, 2 * 240 : 2 * 1040])
     out.parent.mkdir(parents=True, exist_ok=True)
-    both = cv2.resize(np.hstack(halves), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+    both = cv2.resize(np.hstack(halves), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(out), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def enlarged(camera: PinholeCamera) -> PinholeCamera:
+    """The camera of pictures of twice the size."""
+    return PinholeCamera(
+        2 * camera.width,
+        2 * camera.height,
+        2 * camera.fx,
+        2 * camera.fy,
+        2 * camera.cx + 0.5,
+        2 * camera.cy + 0.5,
+        camera.distortion,
+    )
 
 
 def judge_simulated(data: Path) -> dict:

@@ -41,7 +41,14 @@ def draw_overlay(
     if outline is not None:
         _line(drawn, camera.project(outline, T_camera_frame), OUTLINE, width, closed=True)
     for row, (name, (path, colour)) in enumerate((paths or {}).items()):
-        _line(drawn, camera.project(path, T_camera_frame), colour, 2 * width, closed=False)
+        # Each path thinner than the one before, so that none hides another.
+        _line(
+            drawn,
+            camera.project(path, T_camera_frame),
+            colour,
+            max(2, 4 * width - 3 * width * row),
+            closed=False,
+        )
         scale = camera.width / 1280
         place = (round(24 * scale), round((40 + 38 * row) * scale))
         for thick, ink in ((5, (255, 255, 255)), (2, colour)):
