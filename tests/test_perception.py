@@ -239,18 +239,20 @@ def test_marker_layouts(tmp_path: Path) -> None:
             MarkerLayout.load(path)
 
 
+TOO_FAR = "2.2 degrees: probably the lens, which the pictures are told to lack; see docs/perception.md"
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"the photographs are not at {SHARED}")
-def test_photographs_of_a_marker_on_a_rotary_stand() -> None:
+@pytest.mark.parametrize(
+    "angle", [-50, pytest.param(-30, marks=pytest.mark.xfail(strict=True, reason=TOO_FAR)), 40, 60]
+)
+def test_photographs_of_a_marker_on_a_rotary_stand(angle: int) -> None:
     camera = PinholeCamera(1056, 792, 329.873, 332.946, 528.0, 396.0)
-    rotations = {}
-    for path in SHARED.glob("rotary_*.png"):
-        picture = cv2.imread(str(path))
+    rotations = []
+    for turned in (0, angle):
+        picture = cv2.imread(str(SHARED / f"rotary_{turned}.png"))
         seen = align_patterns(picture, detect_markers(picture, "apriltag_36h11"), "apriltag_36h11")
         poses = MarkerBody.single(int(seen.ids[0]), 0.065).poses(seen, camera)
-        rotations[int(path.stem.split("_")[1])] = poses[0].T_camera_body[:3, :3]
-    turns = {
-        angle: np.rad2deg(rotation_angle(rotations[0], R)) - abs(angle) for angle, R in rotations.items()
-    }
-    assert len(turns) == 6
-    assert {angle for angle, error in turns.items() if abs(error) < 2.0} >= {-50, 40, 60}
-    assert abs(turns[-30]) < 2.3  # over what is wanted: see docs/perception.md
+        rotations.append(poses[0].T_camera_body[:3, :3])
+    error = np.rad2deg(rotation_angle(*rotations)) - abs(angle)
+    assert abs(error) < 2.0
