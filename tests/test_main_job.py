@@ -122,6 +122,8 @@ def test_wrong_input_is_one_clear_line(
     cases = {
         "no object given": ["predict", str(run), "--edge", "0"],
         "either --edge": ["predict", str(run), *shape],
+        "--hull goes with --photo": ["predict", str(run), *shape, "--edge", "0", "--hull"],
+        "--photo shows the object": ["predict", str(run), *shape, "--photo", str(polygon)],
         "choose 0 to 3": ["predict", str(run), *shape, "--edge", "4"],
         "between 0 and 1": ["predict", str(run), *shape, "--edge", "0", "--fraction", "1.5"],
         "3 numbers per line": ["predict", str(run), "--polygon", str(bad), "--edge", "0"],

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foretrace.cli.evaluation import print_errors
-from foretrace.cli.learning import read_mask
+from foretrace.cli.outlines import read_mask
 
 if TYPE_CHECKING:
     from foretrace.evaluation.figures import Scene

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from foretrace.cli.console import say
+from foretrace.cli.outlines import read_mask, read_polygon
 from foretrace.cli.recordings import MaskMethod, look_at_photo
-from foretrace.errors import ActionError, PredictionError, ShapeError, TrainingError
+from foretrace.errors import ActionError, PredictionError, TrainingError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -165,7 +166,7 @@ def predict(
             raise PredictionError(
                 "--photo shows the object: leave out the other ways, and --edge and --contact"
             )
-        seen = look_at_photo(photo, camera, markers, height or 0.02, contact_px, mask, background, box, hull)
+        seen = look_at_photo(photo, camera, markers, height, contact_px, mask, background, box, hull)
         obj, action, view, com = (
             seen.sight.placed.object,
             seen.sight.action,
@@ -173,13 +174,17 @@ def predict(
             seen.sight.com_in_action,
         )
     else:
+        of_photo = {"camera": camera, "markers": markers, "contact-px": contact_px}
+        of_photo |= {"background": background, "box": box, "hull": hull or None}
+        if idle := [f"--{option}" for option, value in of_photo.items() if value is not None]:
+            raise PredictionError(f"{', '.join(idle)} goes with --photo: give one, or leave it out")
         obj, action, view, com = _object_and_action(
             polygon, image, scale, mesh, height, edge, fraction, contact
         )
     given = {"friction": friction, "tool_friction": tool_friction, "density": density}
     physics = _known_physics(given, predictor.known, compare)
     imagined = predictor.imagine(view, com, {name: physics[name] for name in predictor.known})
-    name = f"{predictor.features.label} + LSTM"
+    name = f"{predictor.features.label} + LSTM" if predictor.label == "lstm" else predictor.label
     paths = {name: imagined.com_trajectory}
     simulation = SimulationConfig(physics=Physics(**physics))
     truth = simulate_lever_up(obj, action, simulation) if compare else None
@@ -218,40 +223,6 @@ def _known_physics(
         if value is not None and name not in knows and not simulated:
             raise PredictionError(f"the predictor does not know {name}: leave {option} out, or --compare")
     return physics
-
-
-def read_polygon(file: Path) -> "np.ndarray":
-    """Corners (n, 2) [m] from a text file with one "x y" or "x,y" per line; ``#`` starts a comment.
-
-    Raises:
-        ShapeError: If the file is missing or is not such a table.
-    """
-    import numpy as np
-
-    try:
-        text = file.read_text(encoding="utf-8")
-        corners = np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2)
-    except (OSError, ValueError) as error:
-        raise ShapeError(
-            f'cannot read corners from {file} ({error}): write one "x y" per line [m]'
-        ) from error
-    if corners.ndim != 2 or corners.shape[1] != 2:
-        raise ShapeError(f'{file} has {corners.shape[-1]} numbers per line: write one "x y" per line [m]')
-    return corners
-
-
-def read_mask(file: Path) -> "np.ndarray":
-    """A picture (rows, columns) in grey.
-
-    Raises:
-        ShapeError: If the file cannot be read as a picture.
-    """
-    import cv2
-
-    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise ShapeError(f"cannot read a picture from {file}: give a PNG or JPEG, white object on black")
-    return picture
 
 
 def _object_and_action(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
+from foretrace.cli.outlines import read_polygon
 from foretrace.errors import PerceptionError
 
 if TYPE_CHECKING:
@@ -96,7 +97,6 @@ def read_shape(path: Path, height: float | None) -> "ObjectModel":
     """
     import json
 
-    from foretrace.cli.learning import read_polygon
     from foretrace.objects import MeshObject, Prism, object_from_dict
     from foretrace.objects.prism import DEFAULT_HEIGHT
 
@@ -107,7 +107,7 @@ def read_shape(path: Path, height: float | None) -> "ObjectModel":
             return object_from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, AttributeError) as error:
             raise PerceptionError(f"cannot read an object from {path} ({error})") from error
-    return Prism(read_polygon(path), height or DEFAULT_HEIGHT)
+    return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)
 
 
 def _notes(recording: Path, camera: "PinholeCamera", found: Any) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def look_at_photo(
     photo: Path,
     camera: Path | None,
     markers: Path | None,
-    height: float,
+    height: float | None,
     contact_px: tuple[float, float] | None,
     mask: MaskMethod,
     background: Path | None,
@@ -177,7 +177,7 @@ def look_at_photo(
         photo: The photograph.
         camera: The camera's JSON file; by default camera.json beside the photograph.
         markers: Marker layout, of which the table's markers are used; by default markers.json beside it.
-        height: Height of the object [m].
+        height: Height of the object [m]; 0.02 if not given.
         contact_px: Column and row of the contact, on the object's upper rim.
         mask: How the object is found.
         background: Picture of the table without the object, for ``background``.
@@ -191,6 +191,7 @@ def look_at_photo(
     from foretrace.interactions.film_folder import CAMERA, MARKERS
     from foretrace.interactions.pinhole import PinholeCamera
     from foretrace.objects import BEVEL
+    from foretrace.objects.prism import DEFAULT_HEIGHT
     from foretrace.perception import masks
     from foretrace.perception.calibration import read_picture
     from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
@@ -219,6 +220,7 @@ def look_at_photo(
     else:
         found = masks.mask_by_threshold(picture)
     whole = masks.pick_object(found, contact_px)
+    height = DEFAULT_HEIGHT if height is None else height
     placed = place_object(whole, taken_by, T_table_camera, height, min(BEVEL.height, 0.5 * height), hull)
     sight = see(placed, contact_at_pixel(placed, contact_px, taken_by, T_table_camera))
     return LookedAt(sight, picture, taken_by, T_table_camera)

@@ -252,7 +252,8 @@ def _place(
     if shape is not None and layout.T_object_body is not None:
         return PlacedObject(shape, level(T_table_body @ invert_transform(layout.T_object_body)))
     marker_height = float(T_table_body[2, 3])
-    height = shape.height if shape is not None else (config.height or marker_height)
+    guess = marker_height if config.height is None else config.height
+    height = guess if shape is None else shape.height
     if not 0 < marker_height < height + LEAST_LEVEL or abs(marker_height - height) > LEAST_LEVEL:
         raise PerceptionError(
             f"the object's marker lies {1e3 * marker_height:.0f} mm above the table, its object is "
