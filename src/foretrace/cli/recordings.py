@@ -33,6 +33,7 @@ def import_recording(
     start: float | None = None,
     max_gap: float = 0.25,
     topic: str | None = None,
+    depth_topic: str | None = None,
 ) -> None:
     """Turn the film of a lever-up into an interaction of a data set, beside those that are there already.
 
@@ -53,7 +54,8 @@ def import_recording(
         fraction: How far along that edge.
         start: Time stamp at which the blade's path starts [s]; by default told from when the object moves.
         max_gap: The longest time without markers that is bridged [s].
-        topic: Image topic of a bag.
+        topic: Image topic of a bag, if it has several.
+        depth_topic: Depth topic of a bag, aligned with the images; by default the one in the same frame, if any.
     """
     from foretrace.interactions.film_folder import CAMERA, MARKERS
     from foretrace.interactions.pinhole import PinholeCamera
@@ -63,7 +65,7 @@ def import_recording(
     from foretrace.perception.markers import MarkerLayout
     from foretrace.perception.tracking import TrackConfig
 
-    film = open_film(recording, topic)
+    film = open_film(recording, topic, depth_topic)
     seen_by = PinholeCamera.load(camera) if camera is not None else film.camera
     if seen_by is None and (beside := film.beside(CAMERA)) is not None:
         seen_by = PinholeCamera.load(beside)

@@ -1,47 +1,85 @@
 """Films in bags of ROS 1 and ROS 2, read without ROS (``pip install foretrace[ros]``)."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from foretrace.errors import PerceptionError
 from foretrace.interactions.film_folder import Frame
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.bag_pictures import is_depth, read_colour, read_depth
 
 PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR, "bgra8": cv2.COLOR_BGRA2BGR}
-CHANNELS = {"bgr8": 3, "rgb8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
+TOGETHER = 0.02
+"""Depth belongs to a colour picture taken at most so much earlier or later [s]."""
+PATIENCE = 0.5
+"""So long a colour picture waits for a depth picture that comes after it [s]."""
 
 
-def open_bag(path: Path, topic: str | None) -> tuple[Callable[[], Iterator[Frame]], PinholeCamera | None]:
-    """Frames of a bag's colour images, and the camera that its camera_info names.
+class _Stream(NamedTuple):
+    """A topic with pictures."""
+
+    depth: bool
+    """Whether they are of depth."""
+    frame: str
+    """Name of the frame that they were taken in."""
+
+
+def open_bag(
+    path: Path, topic: str | None = None, depth_topic: str | None = None
+) -> tuple[Callable[[], Iterator[Frame]], PinholeCamera | None]:
+    """Frames of a bag's colour images with the depth that belongs to them, and the camera that its camera_info names.
 
     Args:
         path: The bag.
-        topic: Topic of the images; needed if there are several.
+        topic: Topic of the colour images; needed if there are several.
+        depth_topic: Topic of the depth images; by default the one whose frame is that of the colour images, if any.
 
     Raises:
         PerceptionError: The bag is damaged or has no such topic, or rosbags is not installed.
     """
     with _reader(path) as reader:
-        topics = {
-            c.topic: c.msgtype for c in reader.connections if c.msgtype in PICTURES and "depth" not in c.topic
-        }
-        if topic is None and len(topics) == 1:
-            topic = next(iter(topics))
-        if topic is None or topic not in topics:
-            asked = "no image topic" if topic is None else f"no image topic {topic}"
-            found = ", ".join(sorted(topics)) or "none"
-            raise PerceptionError(
-                f"bag {path}: {asked} is chosen; image topics are {found}: name one with --topic"
-            )
-        camera = _camera(reader, topic)
-    chosen: str = topic
-    return lambda: _frames(path, chosen), camera
+        streams = _streams(reader, path)
+        colours = [name for name, stream in streams.items() if not stream.depth]
+        depths = [name for name, stream in streams.items() if stream.depth]
+        colour = _chosen(path, topic, colours, "image topic", "--topic")
+        frame = streams[colour].frame
+        aligned = [name for name in depths if streams[name].frame == frame]
+        if depth_topic is not None or len(aligned) > 1:
+            depth_topic = _chosen(path, depth_topic, depths, "depth topic", "--depth-topic")
+            if depth_topic not in aligned:
+                raise PerceptionError(
+                    f"bag {path}: {depth_topic} is in frame {streams[depth_topic].frame!r}, {colour} in {frame!r}: "
+                    "record depth that is aligned with the colour images"
+                )
+        depth = depth_topic or next(iter(aligned), None)
+        camera = _camera(reader, path, colour)
+    return lambda: _frames(path, colour, depth), camera
+
+
+def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
+    """The topics with pictures, each by its first message; those without a message are left out."""
+    found: dict[str, _Stream] = {}
+    for topic in sorted({c.topic for c in reader.connections if c.msgtype in PICTURES}):
+        for _, _, message in _messages(reader, path, [topic]):
+            found[topic] = _Stream(is_depth(message), message.header.frame_id)
+            break
+    return found
+
+
+def _chosen(path: Path, asked: str | None, topics: list[str], kind: str, option: str) -> str:
+    """The topic that was asked for, or the only one."""
+    if asked is None and len(topics) == 1:
+        return topics[0]
+    if asked is None or asked not in topics:
+        wanted = f"no {kind}" if asked is None else f"no {kind} {asked} with messages"
+        found = f"{kind}s are {', '.join(topics)}: name one with {option}" if topics else f"it has no {kind}"
+        raise PerceptionError(f"bag {path}: {wanted} is chosen; {found}")
+    return asked
 
 
 def _reader(path: Path) -> Any:
@@ -50,11 +88,14 @@ def _reader(path: Path) -> Any:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise PerceptionError("bags need rosbags: `pip install foretrace[ros]`") from error
-    folder = (
-        path.parent
-        if path.suffix.lower() in (".db3", ".mcap") and (path.parent / "metadata.yaml").exists()
-        else path
-    )
+    folder = path
+    if path.suffix.lower() in (".db3", ".mcap"):
+        folder = path.parent
+        if not (folder / "metadata.yaml").is_file():
+            raise PerceptionError(
+                f"bag {path} has no metadata.yaml beside it: copy the bag's whole folder, or make one with "
+                "`ros2 bag reindex`"
+            )
     try:
         return _Opened(AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)), path)
     except Exception as error:  # every kind of damage has an exception of its own there
@@ -83,26 +124,26 @@ def _damaged(path: Path, error: Exception) -> PerceptionError:
     )
 
 
-def _messages(reader: Any, path: Path, topic: str) -> Iterator[tuple[int, Any]]:
-    connections = [c for c in reader.connections if c.topic == topic]
+def _messages(reader: Any, path: Path, topics: list[str]) -> Iterator[tuple[str, float, Any]]:
+    """The messages of some topics in the order of their recording: topic, time of recording [s], content."""
+    connections = [c for c in reader.connections if c.topic in topics]
     try:
-        for connection, stamp, raw in reader.messages(connections=connections):
-            yield stamp, reader.deserialize(raw, connection.msgtype)
+        for connection, recorded, raw in reader.messages(connections=connections):
+            yield connection.topic, 1e-9 * recorded, reader.deserialize(raw, connection.msgtype)
     except PerceptionError:
         raise
     except Exception as error:
         raise _damaged(path, error) from error
 
 
-def _camera(reader: Any, topic: str) -> PinholeCamera | None:
+def _camera(reader: Any, path: Path, topic: str) -> PinholeCamera | None:
     """The first camera_info beside the image topic, or the only one."""
     infos = [c for c in reader.connections if c.msgtype == CAMERA_INFO]
     namespace = topic.rsplit("/", 1)[0]
     near = [c for c in infos if c.topic.startswith(namespace)] or infos
     if not near or (len({c.topic for c in near}) > 1):
         return None
-    for connection, _, raw in reader.messages(connections=near):
-        message = reader.deserialize(raw, connection.msgtype)
+    for _, _, message in _messages(reader, path, [near[0].topic]):
         k, d = (np.asarray(_either(message, name), dtype=float).ravel() for name in ("k", "d"))
         fx, fy, cx, cy = (float(v) for v in k[[0, 4, 2, 5]])
         distortion = tuple(float(v) for v in d) if d.any() else ()
@@ -115,35 +156,30 @@ def _either(message: Any, name: str) -> Any:
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
 
 
-def _frames(path: Path, topic: str) -> Iterator[Frame]:
+def _frames(path: Path, colour: str, depth: str | None) -> Iterator[Frame]:
+    """The colour images in the order of the bag, each with the depth image nearest in time."""
+    waiting: deque[Frame] = deque()
+    before: tuple[float, np.ndarray] | None = None
+
+    def join(frame: Frame, after: tuple[float, np.ndarray] | None = None) -> Frame:
+        near = [one for one in (before, after) if one is not None and abs(one[0] - frame.time) <= TOGETHER]
+        nearest = min(near, key=lambda one: abs(one[0] - frame.time), default=(0.0, None))
+        return Frame(frame.time, frame.picture, nearest[1])
+
     with _reader(path) as reader:
-        for stamp, message in _messages(reader, path, topic):
-            header = message.header.stamp
-            time = header.sec + 1e-9 * header.nanosec
-            yield Frame(float(time or 1e-9 * stamp), _picture(message, path))
-
-
-def _picture(message: Any, path: Path) -> np.ndarray:
-    data = np.asarray(message.data, dtype=np.uint8)
-    if not hasattr(message, "encoding"):
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        if picture is None:
-            raise PerceptionError(
-                f"bag {path} holds a compressed image ({message.format}) that cannot be decoded"
-            )
-        return picture
-    if message.encoding not in CHANNELS:
-        raise PerceptionError(
-            f"bag {path} has images of encoding {message.encoding}: {', '.join(CHANNELS)} can be read"
-        )
-    channels = CHANNELS[message.encoding]
-    if len(data) < message.height * message.step or message.step < message.width * channels:
-        raise PerceptionError(f"bag {path} holds an image of {len(data)} bytes, too few for its size")
-    rows = data[: message.height * message.step].reshape(message.height, message.step)
-    picture = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-    if channels == 1:
-        return cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_GRAY2BGR)
-    code = TO_BGR.get(message.encoding)
-    return (
-        np.ascontiguousarray(picture) if code is None else cv2.cvtColor(np.ascontiguousarray(picture), code)
-    )
+        for topic, recorded, message in _messages(
+            reader, path, [colour] if depth is None else [colour, depth]
+        ):
+            stamp = message.header.stamp
+            time = stamp.sec + 1e-9 * stamp.nanosec or recorded
+            if topic == depth:
+                after = (time, read_depth(message, path))
+                while waiting and waiting[0].time <= time:
+                    yield join(waiting.popleft(), after)
+                before = after
+                continue
+            waiting.append(Frame(time, read_colour(message, path)))
+            while waiting and (depth is None or waiting[0].time < time - PATIENCE):
+                yield join(waiting.popleft())
+        while waiting:
+            yield join(waiting.popleft())

@@ -43,12 +43,13 @@ class Film:
         return None if path is None else read_picture(path)
 
 
-def open_film(path: str | Path, topic: str | None = None) -> Film:
+def open_film(path: str | Path, topic: str | None = None, depth_topic: str | None = None) -> Film:
     """A film of any of the kinds that are read.
 
     Args:
         path: A folder with ``timestamps.csv``, a video file, or a bag of ROS 1 or ROS 2.
         topic: Image topic of a bag; needed if it has several.
+        depth_topic: Topic of a bag's depth images; by default the one that is aligned with the images, if any.
 
     Raises:
         PerceptionError: There is none, or it is of no known kind.
@@ -59,7 +60,7 @@ def open_film(path: str | Path, topic: str | None = None) -> Film:
     if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
         from foretrace.perception.bags import open_bag
 
-        frames, camera = open_bag(path, topic)
+        frames, camera = open_bag(path, topic, depth_topic)
         return Film(path, frames, camera=camera)
     if path.is_dir():
         notes = FilmNotes.load(path)
