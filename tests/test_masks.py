@@ -72,6 +72,20 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return (a & b).sum() / (a | b).sum()
 
 
+def test_a_background_of_several_colours_leaves_no_dent(share: np.ndarray) -> None:
+    """Something dark stands behind the rim, which hides part of it: less contrast is no less object."""
+    columns = np.nonzero(share.max(axis=0) > 0)[0]
+    behind = np.zeros(share.shape, bool)
+    behind[:, columns[len(columns) // 3] : columns[len(columns) // 3] + 14] = True
+    background = np.where(behind[..., None], np.array([95.0, 75, 65]), np.array([200.0, 208, 214]))
+    scene = background * (1 - share[..., None]) + np.array([150.0, 90, 20]) * share[..., None]
+    blurred = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in (scene, background)]
+    rng = np.random.default_rng(0)
+    noisy = [np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for image in blurred]
+    found = masks.pick_object(masks.mask_by_background(noisy[0], noisy[1]))
+    assert iou(found, share > 0.5) > 0.995
+
+
 @pytest.mark.parametrize("way", ["background", "threshold", "colour", "grabcut"])
 def test_ways_to_find_an_object(share: np.ndarray, way: str) -> None:
     scene, background = picture(share, light=0.9)

@@ -13,8 +13,8 @@ from foretrace.interactions.topdown import MINIMAL_HEIGHT
 
 LEAST_CHANGE = 14.0
 """A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
-EDGE_WIDTH = 9
-"""Within so many pixels a blurred edge has risen to its full height."""
+EDGE_DEPTH = 4
+"""So many pixels inside what differs, a blurred edge has risen to the object's own colour."""
 SMALLEST_OBJECT = 400
 """An object of fewer pixels is taken for noise."""
 PLANE_SAMPLES = 20000
@@ -46,16 +46,39 @@ def mask_by_background(
         )
     now, before = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8) for image in (picture, background))
     gain = np.median((now + 1.0) / (before + 1.0), axis=(0, 1))
-    change = np.abs(now - gain * before).max(axis=2)
-    mask = change > least_change
+    before = gain * before
+    mask = np.abs(now - before).max(axis=2) > least_change
     if mask.mean() > 0.6:
         raise PerceptionError(
             f"{100 * mask.mean():.0f} % of the picture differ from the background: was the camera moved or the light "
             "switched? take both anew"
         )
-    # Blur makes edges wide: they lie where the change has half of the height that it reaches close by.
-    height = cv2.dilate(cv2.medianBlur(change, 5), np.ones((EDGE_WIDTH, EDGE_WIDTH), np.uint8))
-    return mask & (change > 0.5 * height)
+    return mask & (_coverage(now, before, mask) > 0.5)
+
+
+def _coverage(
+    now: Float[np.ndarray, "rows columns 3"],
+    before: Float[np.ndarray, "rows columns 3"],
+    mask: Bool[np.ndarray, "rows columns"],
+) -> Float[np.ndarray, "rows columns"]:
+    """Which part of each pixel something new covers: blur mixes its colour with that of the background behind it.
+
+    Its colour is that of the nearest pixel well inside the mask; 1 where none is close, or where the two look alike.
+    """
+    size = 2 * EDGE_DEPTH + 1
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    away, nearest = cv2.distanceTransformWithLabels(
+        1 - inside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    rows, columns = np.nonzero(mask & (inside == 0) & (away <= 2 * size))
+    colours = np.zeros((int(nearest.max()) + 1, 3), dtype=now.dtype)
+    colours[nearest[inside > 0]] = now[inside > 0]
+    apart = colours[nearest[rows, columns]] - before[rows, columns]
+    length = (apart**2).sum(axis=1)
+    mixed = ((now[rows, columns] - before[rows, columns]) * apart).sum(axis=1)
+    coverage = np.ones(mask.shape)
+    coverage[rows, columns] = np.where(length > LEAST_CHANGE**2, mixed / np.maximum(length, 1e-9), 1.0)
+    return coverage
 
 
 def mask_by_threshold(
