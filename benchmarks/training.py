@@ -22,6 +22,7 @@ from foretrace.features import make_features
 from foretrace.features.base import fast_precision
 from foretrace.objects import Prism
 from foretrace.predictor import LstmConfig, LstmPredictor, TrainConfig
+from foretrace.predictor.states import Effects
 
 NUM_TRAJECTORIES, NUM_SAMPLES, BATCH, PLAIN_EPOCHS = 1400, 60, 32, 100
 LABELS = ("im-cnn", "sc-800", "none")
@@ -80,10 +81,11 @@ def shipped_step(label: str, config: LstmConfig) -> Callable[[], None]:
     optimizer = torch.optim.AdamW([p for p in predictor.parameters() if p.requires_grad], fused=True)
     inputs = views() if label == "im-cnn" else torch.randn(BATCH, predictor.features.num_features)
     states, lengths = torch.randn(BATCH, NUM_SAMPLES, 3), torch.full((BATCH,), NUM_SAMPLES)
+    effects = Effects(states, lengths, torch.zeros(BATCH, dtype=torch.long))
 
     def step() -> None:
         features = predictor.features(inputs) if predictor.features.trainable else inputs
-        loss = predictor.training_loss(features, states, lengths)
+        loss = predictor.training_loss(features, effects)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -6,15 +6,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from factories import fake_batch
-from foretrace.errors import TrainingError
+from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import make_features
 from foretrace.features.outline import MAX_CORNERS, UNIT
 from foretrace.features.support_points import support_points_by_rule
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.splits import Split
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 from foretrace.predictor import OneShotConfig, OneShotPredictor, load_predictor, save_checkpoint
-from foretrace.predictor.hinges import find_hinges, mirror_corners
-from foretrace.predictor.one_shot import rotation_matrix, rotation_vector
+from foretrace.predictor.futures import along_hinges, quantiles_of
+from foretrace.predictor.hinges import NUM_VALUES, PROBES, find_hinges, mirror_corners
+from foretrace.predictor.states import decode_poses, encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error
 
@@ -27,7 +29,7 @@ QUICK = TrainConfig(
     batch_size=4,
     learning_rate=4e-3,
     split=None,
-    outcomes=("levered",),
+    outcomes=("levered", "slipped"),
 )
 
 
@@ -61,48 +63,69 @@ def everything(batch) -> Split:
     return Split(rows, rows, rows)
 
 
-def test_the_hinge_is_the_rules_support_edge(batch):
+def test_the_first_hinge_is_the_rules_support_edge(batch):
     hinges = find_hinges(exact_corners(batch), torch.from_numpy(batch.com[:, 0]))
+    ends, axes = hinges.ends[:, 0], hinges.axes[:, 0, 0]
     rule = support_points_by_rule(batch)
-    np.testing.assert_allclose(np.sort(hinges.ends, axis=1), np.sort(rule, axis=1), atol=1e-12)
-    product = hinges.axes @ hinges.axes.mT
+    np.testing.assert_allclose(np.sort(ends, axis=1), np.sort(rule, axis=1), atol=1e-12)
+    product = axes @ axes.mT
     torch.testing.assert_close(product, torch.eye(3, dtype=torch.float64).expand_as(product))
-    assert (torch.linalg.det(hinges.axes) > 0).all()
+    assert (torch.linalg.det(axes) > 0).all()
     # The first axis points out of the object.
-    outwards = hinges.ends.mean(dim=1) - torch.from_numpy(batch.com[:, 0, :2])
-    assert ((hinges.axes[:, 0, :2] * outwards).sum(dim=1) > 0).all()
+    outwards = ends.mean(dim=1) - torch.from_numpy(batch.com[:, 0, :2])
+    assert ((axes[:, 0, :2] * outwards).sum(dim=1) > 0).all()
+
+
+def test_the_second_hinge_is_a_neighbour_of_the_first(batch):
+    ends = find_hinges(exact_corners(batch), torch.from_numpy(batch.com[:, 0])).ends
+    after = (ends[:, 0, 1] - ends[:, 1, 0]).norm(dim=1) < 1e-12
+    before = (ends[:, 0, 0] - ends[:, 1, 1]).norm(dim=1) < 1e-12
+    assert (after ^ before).all()
 
 
 def test_mirror_images_have_mirrored_hinges(batch):
     corners, com = exact_corners(batch), torch.from_numpy(batch.com[:, 0])
     mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
     hinges, images = find_hinges(corners, com), find_hinges(mirror_corners(corners), com * mirror)
-    torch.testing.assert_close(images.ends.flip(1), hinges.ends * mirror[:2])
-    torch.testing.assert_close(images.values[:, :2], hinges.values[:, :2])
+    torch.testing.assert_close(images.ends.flip(2), hinges.ends * mirror[:2])
+    torch.testing.assert_close(images.values, hinges.values.flip(1))
+    torch.testing.assert_close(images.axes * mirror, hinges.axes.flip(1))
     torch.testing.assert_close(mirror_corners(mirror_corners(corners)), corners)
+
+
+def test_heights_are_those_above_the_places_seen_from_the_hinge():
+    # A block whose height grows along the action, seen as a map of cells as large as pixels.
+    corners = torch.tensor([[[0.0, 0.04], [0.0, -0.04], [0.1, -0.04], [0.1, 0.04], [0.0, 0.04]]])
+    x = torch.from_numpy((CONTACT_PIXEL[0] - np.arange(VIEW_SIZE)) * METRES_PER_PIXEL).float()
+    heights = x[:, None].expand(-1, VIEW_SIZE)[None]
+    hinges = find_hinges(corners, torch.tensor([[0.05, 0.001, 0.01]]), 1, heights)
+    torch.testing.assert_close(hinges.axes[0, 0, 0, 0], torch.tensor([1.0, 0.0, 0.0]))
+    probed = 0.1 * hinges.values[0, :, 0, NUM_VALUES:].unflatten(1, (PROBES, PROBES))
+    expected = (torch.arange(PROBES) + 0.5) / PROBES * 0.1
+    torch.testing.assert_close(probed, expected[None, :, None].expand(2, PROBES, PROBES), atol=1e-5, rtol=0)
 
 
 def test_the_object_turns_about_the_second_axis(batch):
     hinges = find_hinges(exact_corners(batch), torch.from_numpy(batch.com[:, 0]))
     # The synthetic lever-ups turn about the edge ahead of the contact point, mostly the rule's.
-    apart = np.sort(hinges.ends, axis=1) - np.sort(batch.support_points, axis=1)
+    apart = np.sort(hinges.ends[:, 0], axis=1) - np.sort(batch.support_points, axis=1)
     same = (np.abs(apart).max(axis=(1, 2)) < 1e-9) & (batch.outcome == "levered")
     assert same.mean() > 0.7
-    rotation = torch.from_numpy(quaternion_to_matrix(batch.pose[same, 10:12, 3:]))
-    turn = rotation_vector(rotation[:, 1] @ rotation[:, 0].mT)
-    along = (hinges.axes[same] @ turn[..., None])[..., 0]
-    assert (along[:, 1] > 0).all()
-    torch.testing.assert_close(along[:, [0, 2]], torch.zeros(int(same.sum()), 2, dtype=torch.float64))
+    states = torch.from_numpy(encode_states(batch, "turn", batch.length))
+    turn = along_hinges(hinges.axes[same, 0, 0], states[same])[:, 11, 3:]
+    assert (turn[:, 1] > 0).all()
+    torch.testing.assert_close(turn[:, [0, 2]], torch.zeros(int(same.sum()), 2, dtype=torch.float64))
 
 
-def test_rotation_vectors_are_those_of_scipy():
-    vectors = np.random.default_rng(0).normal(size=(50, 3))
-    vectors[0], vectors[1] = 0, 1e-9
-    matrices = rotation_matrix(torch.from_numpy(vectors))
-    np.testing.assert_allclose(matrices, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(
-        rotation_vector(matrices), Rotation.from_matrix(matrices).as_rotvec(), atol=1e-7
-    )
+def test_what_is_seen_in_the_mirror_is_the_same_motion(batch):
+    corners, com = exact_corners(batch), torch.from_numpy(batch.com[:, 0])
+    hinges = find_hinges(corners, com)
+    motion = torch.from_numpy(encode_states(batch, "turn", batch.length))
+    images = motion * torch.tensor([1.0, -1, 1, -1, 1, -1], dtype=torch.float64)
+    mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    image_hinges = find_hinges(mirror_corners(corners), com * mirror)
+    seen, seen_image = along_hinges(hinges.axes[:, 1], motion), along_hinges(image_hinges.axes[:, 0], images)
+    torch.testing.assert_close(seen, seen_image)
 
 
 def test_mirror_images_have_mirrored_motions(batch):
@@ -153,6 +176,113 @@ def test_an_interrupted_training_ends_with_the_same_model(batch, tmp_path, monke
     monkeypatch.undo()
     cut = train_predictor(batch, QUICK, tmp_path / "cut", split=everything(batch), progress=False)
     assert (cut / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+
+
+LONGER = replace(QUICK, epochs=40, learning_rate=1e-2)
+
+
+def test_futures_are_told_apart(batch):
+    predictor, _ = fit_predictor(batch, LONGER, everything(batch))
+    imagined = predictor.imagine_batch(batch)
+    futures = imagined.futures
+    assert futures is not None
+    assert futures.outcome == ("levered", "slipped") * 2
+    np.testing.assert_allclose(futures.probability.sum(axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(sum(futures.outcomes().values()), 1, atol=1e-5)
+    best = futures.probability.argmax(axis=1)
+    rows = np.arange(len(batch))
+    np.testing.assert_array_equal(imagined.com, futures.com[rows, best])
+    one = imagined[3]
+    assert one.futures is not None
+    np.testing.assert_array_equal(one.futures.com[0], futures.com[3])
+    # Seen again, outcomes are known.
+    told = np.array(futures.outcome)[best]
+    assert (told == batch.outcome).mean() > 0.9
+
+
+def test_regions_grow_with_their_level_and_hold_what_was_seen(batch):
+    predictor, _ = fit_predictor(batch, LONGER, everything(batch))
+    futures = predictor.imagine_batch(batch).futures
+    assert futures is not None
+    narrow, wide = (np.nan_to_num(futures.radius(level)) for level in (0.5, 0.9))
+    assert (narrow <= wide).all()
+    apart = np.linalg.norm(futures.com - batch.com[:, None], axis=-1)
+    inside = (apart <= futures.radius(0.5)) | ~(np.arange(24) < batch.length[:, None])[:, None]
+    # The quantiles were taken from the same twelve.
+    assert inside.all(axis=2).any(axis=1).sum() >= 6
+    with pytest.raises(ValueError, match=r"level 1.0 of a region: choose one from 0.01 to 0.99"):
+        futures.radius(1.0)
+
+
+def test_scores_in_any_order_give_regions_of_their_level():
+    rng = np.random.default_rng(0)
+    covered = []
+    for _ in range(300):
+        quantiles = quantiles_of(rng.exponential(size=99))
+        covered.append(rng.exponential(size=50) <= quantiles[[49, 89]][:, None])
+    np.testing.assert_allclose(np.mean(covered, axis=(0, 2)), [0.5, 0.9], atol=0.015)
+    assert np.isinf(quantiles_of(rng.exponential(size=5))[-1])
+
+
+def test_observed_samples_bend_the_rest(batch):
+    predictor, _ = fit_predictor(batch, LONGER, everything(batch))
+    # Motions that may happen by its own account.
+    features = predictor.compute_features(predictor.features.inputs(batch))
+    mixture = predictor.mixture(features, torch.from_numpy(batch.com[:, 0]).float())
+    drawn = mixture.sample(1, torch.Generator().manual_seed(0))[:, 0].detach().double().numpy()
+    happened = replace(batch, com=drawn[..., :3], pose=decode_poses(drawn), length=np.full(len(batch), 24))
+    plain, after = predictor.imagine_batch(happened), predictor.imagine_batch(happened, observed=12)
+    np.testing.assert_allclose(after.com[:, :12], happened.com[:, :12], atol=1e-6)
+    errors = [np.asarray(mean_distance(i.com[:, 12:], drawn[:, 12:, :3])).mean() for i in (plain, after)]
+    assert errors[1] < 0.5 * errors[0]
+    # One at a time gives the same as a batch.
+    poses = decode_poses(drawn[0, :12])
+    one = predictor.imagine(TopDownView(batch.mask[0], batch.height[0]), observed=poses)
+    np.testing.assert_allclose(one.com_trajectory, after.com[0], atol=1e-5)
+
+
+def test_samples_that_cannot_be_used_are_refused(batch):
+    predictor, _ = fit_predictor(batch, QUICK, everything(batch))
+    view = TopDownView(batch.mask[0], batch.height[0])
+    rest = np.array([[*batch.com[0, 0], 1, 0, 0, 0]])
+    with pytest.raises(PredictionError, match=r"of shape \(24, 7\): give rows of 7 numbers, from 1 to 23"):
+        predictor.imagine(view, observed=rest.repeat(24, axis=0))
+    with pytest.raises(PredictionError, match="not finite"):
+        predictor.imagine(view, observed=np.full((3, 7), np.nan))
+    short = replace(batch, length=np.full(len(batch), 4))
+    with pytest.raises(PredictionError, match="has 4 samples, fewer than the 5 to be observed"):
+        predictor.imagine_batch(short, observed=5)
+    lstm, _ = fit_predictor(batch, replace(QUICK, predictor="lstm", features="none"), everything(batch))
+    with pytest.raises(PredictionError, match="the lstm predictor makes no use of observed samples"):
+        lstm.imagine(view, observed=rest)
+
+
+def test_samples_drawn_scatter_as_far_as_said(batch):
+    predictor, _ = fit_predictor(batch, LONGER, everything(batch))
+    features = predictor.compute_features(predictor.features.inputs(batch))
+    mixture = predictor.mixture(features, torch.from_numpy(batch.com[:, 0]).float())
+    alone = torch.full_like(mixture.odds, -torch.inf)
+    alone[:, 0, 0] = 0.0
+    drawn = replace(mixture, odds=alone).sample(4000, torch.Generator().manual_seed(0))[..., :3]
+    found = (drawn - mixture.states()[:, :1, :, :3]).square().sum(dim=-1).mean(dim=1).sqrt()
+    torch.testing.assert_close(found, mixture.spread()[:, 0], rtol=0.05, atol=1e-6)
+
+
+def test_heights_tell_objects_of_one_outline_apart(batch):
+    tall = replace(batch, height=np.where(np.arange(len(batch))[:, None, None] % 2, 2, 1) * batch.height)
+    config = replace(QUICK, feature_options={"heights": True})
+    predictor, _ = fit_predictor(tall, config, everything(tall))
+    lower = replace(tall, height=batch.height)
+    changed = np.abs(predictor.imagine_batch(tall).com - predictor.imagine_batch(lower).com).max(axis=(1, 2))
+    assert (changed[1::2] > 1e-7).all()
+    assert (changed[::2] < 1e-9).all()
+
+
+def test_outcomes_that_are_not_learned_are_refused(batch):
+    with pytest.raises(TrainingError, match="outcome 'slipped', and the predictor is to learn levered"):
+        fit_predictor(batch, replace(QUICK, outcomes=("levered",)), everything(batch))
+    with pytest.raises(TrainingError, match="unknown outcome 'flown'; choose from levered, slipped"):
+        OneShotConfig(outcomes=("flown",))
 
 
 def test_what_is_known_changes_what_is_said(batch):

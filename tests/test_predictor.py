@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 
 from factories import fake_batch
@@ -12,13 +15,14 @@ from foretrace.predictor import LstmConfig, LstmPredictor
 from foretrace.predictor.base import estimate_com
 from foretrace.predictor.lstm import ProjectedLstm
 from foretrace.predictor.states import (
+    Effects,
     decode_poses,
     encode_states,
     rest_states,
     state_statistics,
     valid_samples,
 )
-from foretrace.trajectories import mean_distance
+from foretrace.trajectories import mean_distance, rotation_error
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +179,10 @@ def test_oracles_do_not_imagine_from_a_view(batch):
     assert predictor.imagine_batch(batch).com.shape == (8, 24, 3)
 
 
+def effects(states: torch.Tensor, lengths: torch.Tensor) -> Effects:
+    return Effects(states, lengths, torch.zeros(len(states), dtype=torch.long))
+
+
 @pytest.mark.parametrize("window", [5, 23, 60])
 @pytest.mark.parametrize("ahead", [1, 3])
 @pytest.mark.parametrize("residual", [True, False])
@@ -183,7 +191,7 @@ def test_the_loss_is_the_mean_over_every_steps_predictions(batch, ahead, window,
     states = torch.from_numpy(encode_states(batch, "position")).float()
     lengths = torch.tensor([24, 24, 13, 2, 24, 7, 24, 24])
     with torch.no_grad():
-        loss = predictor.training_loss(torch.zeros(8, 0), states, lengths)
+        loss = predictor.training_loss(torch.zeros(8, 0), effects(states, lengths))
         reference, errors = reference_lstm(predictor.lstm), []
         for row, length in zip(states, lengths, strict=True):
             predicted = predictor.output(reference(row[None])[0][0]).view(24, ahead, 3)
@@ -198,7 +206,7 @@ def test_the_gradient_stops_at_the_windows_edge(batch):
     def gradient(window: int) -> torch.Tensor:
         predictor = make(batch, "none", window=window)
         states = predictor.normalise(encode_states(batch[:4], "position"))
-        predictor.training_loss(torch.zeros(4, 0), states, torch.full((4,), 20)).backward()
+        predictor.training_loss(torch.zeros(4, 0), effects(states, torch.full((4,), 20))).backward()
         return predictor.lstm.weight_hidden.grad
 
     torch.testing.assert_close(gradient(23), gradient(60))
@@ -208,9 +216,9 @@ def test_the_gradient_stops_at_the_windows_edge(batch):
 def test_what_lies_past_the_end_is_not_learned(batch):
     predictor = make(batch, "none")
     states, lengths = torch.randn(8, 24, 3), torch.full((8,), 10)
-    loss = predictor.training_loss(torch.zeros(8, 0), states, lengths)
+    loss = predictor.training_loss(torch.zeros(8, 0), effects(states, lengths))
     states[:, 10:] = 0.0
-    torch.testing.assert_close(predictor.training_loss(torch.zeros(8, 0), states, lengths), loss)
+    torch.testing.assert_close(predictor.training_loss(torch.zeros(8, 0), effects(states, lengths)), loss)
 
 
 def test_pose_states_there_and_back(batch):
@@ -223,6 +231,18 @@ def test_pose_states_there_and_back(batch):
     since_rest = quaternion_to_matrix(batch.pose[0, 20, 3:]) @ quaternion_to_matrix(batch.pose[0, 0, 3:]).T
     back = quaternion_to_matrix(decode_poses(states[0, 20])[3:])
     np.testing.assert_allclose(back, since_rest, atol=1e-9)
+
+
+def test_turns_go_on_beyond_half_a_turn(batch):
+    times = np.arange(24)
+    rolled = Rotation.from_rotvec(np.outer(times * 0.5, [0.0, 0.6, 0.8])).as_quat(scalar_first=True)
+    pose = batch.pose[:1].copy()
+    pose[0, :, 3:] = rolled
+    one = replace(batch[:1], pose=pose, length=np.array([24]), slip_index=np.array([24]))
+    states = encode_states(one, "turn")
+    np.testing.assert_allclose(states[0, :, 3:], np.outer(times * 0.5, [0.0, 0.6, 0.8]), atol=1e-9)
+    np.testing.assert_allclose(states[:, 0], rest_states(one.com[:, 0], "turn"), atol=1e-12)
+    np.testing.assert_allclose(rotation_error(decode_poses(states)[0, :, 3:], rolled), 0, atol=1e-7)
 
 
 def test_samples_after_a_slip_are_cut(batch):
@@ -253,6 +273,6 @@ def test_every_number_of_steps_and_every_state_can_be_learned(batch, state, ahea
         if step % 200 == 0:
             errors.append(mean_distance(predictor.imagine_batch(four).com, four.com).mean())
         optimizer.zero_grad()
-        predictor.training_loss(torch.zeros(4, 0), states, torch.full((4,), 24)).backward()
+        predictor.training_loss(torch.zeros(4, 0), effects(states, torch.full((4,), 24))).backward()
         optimizer.step()
     assert errors[1] < 0.25 * errors[0]

@@ -200,6 +200,32 @@ def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray
     return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
+def rotation_vector_to_quaternion(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Unit quaternion ``w, x, y, z`` of axis times angle [rad], with w >= 0."""
+    half = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
+    quaternion = np.concatenate([np.cos(half), vector / 2 * np.sinc(half / np.pi)], axis=-1)
+    return np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def continuous_rotation_vectors(
+    matrices: Float[np.ndarray, "*batch time 3 3"],
+) -> Float[np.ndarray, "*batch time 3"]:
+    """Axis times angle [rad] of rotations over time, starting near none, without the jumps at half a turn."""
+    quaternions = matrix_to_quaternion(matrices)
+    axes, length = quaternions[..., 1:], np.linalg.norm(quaternions[..., 1:], axis=-1, keepdims=True)
+    angles = 2 * np.arctan2(length, quaternions[..., :1])
+    vectors = np.where(length > 1e-12, axes / np.maximum(length, 1e-12) * angles, 0.0)
+    for k in range(1, vectors.shape[-2]):
+        before, here = vectors[..., k - 1, :], vectors[..., k, :]
+        angle = np.linalg.norm(here, axis=-1, keepdims=True)
+        unturned = angle < 1e-9  # the axis of a whole turn is that of the sample before
+        along = np.where(unturned, before, here)
+        axis = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+        turns = np.round(((before * axis).sum(axis=-1, keepdims=True) - angle) / (2 * np.pi))
+        vectors[..., k, :] = axis * (angle + 2 * np.pi * turns)
+    return vectors
+
+
 def rotation_angle(
     rotation_a: Float[np.ndarray, "*#batch 3 3"], rotation_b: Float[np.ndarray, "*#batch 3 3"]
 ) -> Float[np.ndarray, "*batch"]:

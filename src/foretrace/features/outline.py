@@ -23,6 +23,8 @@ Measured on prisms of 3 to 10 corners: eight hulls in ten get exactly as many co
 """
 HULL_MARGIN = 1.6
 """Points of the outline further inside the hull than this lie in a notch and do not count [pixels]."""
+HEIGHT_CELLS = 32
+"""Cells along a side of the coarse height map."""
 FARTHEST_CORNER = 4.0
 """Lines that meet further than this from where the outline turns do not make its corner [pixels]."""
 
@@ -35,17 +37,25 @@ class Outline(FeatureExtractor):
 
     x and y of ``MAX_CORNERS`` corners in the action frame, in units of 10 cm. The first corner, repeated, fills the
     row. The hull is fitted to the mask's outline, see `fit_hull`.
+
+    Args:
+        heights: Whether a coarse height map follows the corners: means over 4 x 4 pixels, 0 beside the object, row
+            by row, in units of 10 cm.
     """
 
     label = "outline"
 
+    def __init__(self, heights: bool = False):
+        super().__init__(heights=heights)
+        self.heights = heights
+
     @property
     def num_features(self) -> int:
-        """Two coordinates for each corner."""
-        return 2 * MAX_CORNERS
+        """Two coordinates for each corner, and the heights."""
+        return 2 * MAX_CORNERS + self.heights * HEIGHT_CELLS**2
 
-    def inputs(self, batch: InteractionBatch) -> Float[Tensor, "batch 48"]:
-        """The corners.
+    def inputs(self, batch: InteractionBatch) -> Float[Tensor, "batch features"]:
+        """The corners, and the heights.
 
         Raises:
             PredictionError: A mask is empty.
@@ -60,10 +70,15 @@ class Outline(FeatureExtractor):
             hull = fit_hull(mask)
             row[:] = hull[0]
             row[: len(hull)] = hull
-        return torch.from_numpy(rows / UNIT).float().flatten(1)
+        corners = torch.from_numpy(rows / UNIT).float().flatten(1)
+        if not self.heights:
+            return corners
+        side = batch.height.shape[1] // HEIGHT_CELLS
+        cells = batch.height.reshape(len(batch), HEIGHT_CELLS, side, HEIGHT_CELLS, side).mean(axis=(2, 4))
+        return torch.cat([corners, torch.from_numpy(cells / UNIT).float().flatten(1)], dim=1)
 
-    def forward(self, inputs: Float[Tensor, "batch 48"]) -> Float[Tensor, "batch 48"]:
-        """Hand the corners on."""
+    def forward(self, inputs: Float[Tensor, "batch features"]) -> Float[Tensor, "batch features"]:
+        """Hand them on."""
         return inputs
 
 

@@ -11,12 +11,22 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
-from foretrace.errors import PredictionError
+from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import FeatureExtractor, Precision
+from foretrace.geometry import continuous_rotation_vectors, quaternion_to_matrix
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, TopDownView
+from foretrace.predictor.futures import Futures
 from foretrace.predictor.known import check_names, given_values, observed_values
-from foretrace.predictor.states import StateKind, decode_poses, rest_states, state_size
+from foretrace.predictor.states import (
+    Effects,
+    StateKind,
+    decode_poses,
+    encode_states,
+    rest_states,
+    state_size,
+    valid_lengths,
+)
 
 ROWS_AT_ONCE = 256
 """Images convolved together: bounds the memory that it takes."""
@@ -36,6 +46,9 @@ class ImaginedEffect:
     pose_trajectory: Float[np.ndarray, "time 7"] | None = None
     """Position of the centre of mass [m] and quaternion (w, x, y, z) of the rotation since rest, about the
     action frame's axes: the identity at first. None if the predictor knows positions only."""
+    futures: Futures | None = None
+    """All that may happen, one row; the trajectories above are those of the most probable. None if the predictor
+    tells of one future only."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +61,16 @@ class ImaginedBatch:
     """Centres of mass in the action frame [m]."""
     pose: Float[np.ndarray, "batch time 7"] | None = None
     """As ``ImaginedEffect.pose_trajectory``, one per interaction."""
+    futures: Futures | None = None
+    """As ``ImaginedEffect.futures``, one row per interaction."""
 
     def __len__(self) -> int:
         return len(self.com)
 
     def __getitem__(self, index: int) -> ImaginedEffect:
-        return ImaginedEffect(self.times, self.com[index], None if self.pose is None else self.pose[index])
+        pose = None if self.pose is None else self.pose[index]
+        futures = None if self.futures is None else self.futures[np.array([index])]
+        return ImaginedEffect(self.times, self.com[index], pose, futures)
 
 
 class EffectPredictor(nn.Module, ABC):
@@ -68,6 +85,7 @@ class EffectPredictor(nn.Module, ABC):
         state: What it predicts.
         num_samples: Samples in an imagined trajectory.
         known: Physical constants that it is told beside the view: some of `known.KNOWN`.
+        outcomes: Outcomes that it tells apart; none if it expects but one thing to happen.
     """
 
     label: ClassVar[str]
@@ -79,10 +97,16 @@ class EffectPredictor(nn.Module, ABC):
     known_scale: Tensor
 
     def __init__(
-        self, features: FeatureExtractor, state: StateKind, num_samples: int, known: Sequence[str] = ()
+        self,
+        features: FeatureExtractor,
+        state: StateKind,
+        num_samples: int,
+        known: Sequence[str] = (),
+        outcomes: Sequence[str] = (),
     ):
         super().__init__()
         self.features = features
+        self.outcomes = tuple(outcomes)
         self.state: StateKind = state
         self.register_buffer("state_mean", torch.zeros(state_size(state)))
         self.register_buffer("state_scale", torch.ones(state_size(state)))
@@ -97,28 +121,47 @@ class EffectPredictor(nn.Module, ABC):
     def config(self) -> Any:
         """The frozen dataclass of settings that this predictor was made with."""
 
-    def prepare(
-        self,
-        features: Float[Tensor, "batch inputs"],
-        states: Float[Tensor, "batch time state"],
-        lengths: Int[Tensor, " batch"],
-    ) -> None:
-        """Take from the whole training part what is needed before the first step; by default nothing.
+    def lengths(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
+        """Samples of each trajectory that are learned: up to where the object slipped."""
+        return valid_lengths(batch)
 
-        The arguments are those of `training_loss`.
+    def encode(self, batch: InteractionBatch) -> Float[np.ndarray, "batch time state"]:
+        """What is learned of trajectories: states in the action frame [m], zeros past their lengths."""
+        return encode_states(batch, self.state, self.lengths(batch))
+
+    def number_outcomes(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
+        """Which of its outcomes became of each interaction.
+
+        Raises:
+            TrainingError: One that it does not tell apart.
         """
+        if not self.outcomes:
+            return np.zeros(len(batch), dtype=np.int64)
+        if odd := sorted(set(batch.outcome.tolist()) - set(self.outcomes)):
+            raise TrainingError(
+                f"an interaction has the outcome {odd[0]!r}, and the predictor is to learn "
+                f"{', '.join(self.outcomes)}: name it among the outcomes or leave the interaction out"
+            )
+        return np.array([self.outcomes.index(name) for name in batch.outcome.tolist()], dtype=np.int64)
+
+    def prepare(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
+        """Take from the whole training part what is needed before the first step; by default nothing."""
 
     @abstractmethod
-    def training_loss(
-        self,
-        features: Float[Tensor, "batch inputs"],
-        states: Float[Tensor, "batch time state"],
-        lengths: Int[Tensor, " batch"],
-    ) -> Float[Tensor, ""]:
-        """The error to minimise on normalised states, of which row ``i`` is valid up to ``lengths[i]``.
+    def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
+        """The error to minimise.
 
         ``features`` are those of the object and, behind them, what is known: as from `add_known`.
         """
+
+    def finish(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        effects: Effects,
+        other_features: Float[Tensor, "other inputs"],
+        other_effects: Effects,
+    ) -> None:
+        """Take from training and validation part what is needed after the last step; by default nothing."""
 
     def validation_loss(self, off: Float[np.ndarray, "samples state"]) -> float:
         """What the best epoch has least of, from how far imagined normalised states are off: the mean square."""
@@ -193,6 +236,7 @@ class EffectPredictor(nn.Module, ABC):
         view: TopDownView,
         com: Float[np.ndarray, "3"] | None = None,
         known: Mapping[str, float] | None = None,
+        observed: Float[np.ndarray, "samples 7"] | None = None,
     ) -> ImaginedEffect:
         """Imagine the effect of the action on the object in a view.
 
@@ -201,10 +245,13 @@ class EffectPredictor(nn.Module, ABC):
             com: Its centre of mass at rest in the action frame [m]. Estimated from the view if not given:
                 above the centre of the mask's area, at half the object's greatest height.
             known: Values of the constants that the predictor was trained to know, by name [SI].
+            observed: The motion's first samples, at the first of the predictor's times, where it is under way
+                already: rows as of ``ImaginedEffect.pose_trajectory``. The first one is at rest.
 
         Raises:
             PredictionError: The predictor's features are only known after the action; or a known value is missing,
-                is not finite, or is none that the predictor knows.
+                is not finite, or is none that the predictor knows; or the predictor makes no use of samples, or
+                they are too many.
         """
         if self.features.oracle:
             raise PredictionError(
@@ -212,31 +259,70 @@ class EffectPredictor(nn.Module, ABC):
                 "a view: use a predictor with other features"
             )
         batch = InteractionBatch.from_views([view])
-        start = estimate_com(batch) if com is None else np.asarray(com, dtype=float)[None]
+        seen = None if observed is None else self._check_observed(np.asarray(observed, dtype=float))
+        if com is None:
+            com = estimate_com(batch)[0] if seen is None else seen[0, :3]
         values = given_values(known, self.known)
-        return self._imagine_from(self.features.inputs(batch), values, start)[0]
+        features = self.add_known(self.compute_features(self.features.inputs(batch)), values)
+        seen = None if seen is None else seen[None]
+        return self.imagine_effects(features, np.asarray(com, dtype=float)[None], seen)[0]
 
-    def imagine_batch(self, batch: InteractionBatch, start: Start = "observed") -> ImaginedBatch:
+    def imagine_batch(
+        self, batch: InteractionBatch, start: Start = "observed", observed: int = 0
+    ) -> ImaginedBatch:
         """Imagine the effects of many actions.
 
         Args:
             batch: The interactions; of their trajectories only the first sample is read, and not even that if
                 ``start`` is ``estimated``. Their constants are read if the predictor knows them.
             start: Whether the roll-out starts from the recorded first state or from the view's estimate.
+            observed: How many samples of the motions are known already.
 
         Raises:
-            PredictionError: A constant that the predictor knows is not recorded.
+            PredictionError: A constant that the predictor knows is not recorded; or the predictor makes no use of
+                observed samples, or they are too many.
         """
         com = batch.com[:, 0] if start == "observed" else estimate_com(batch)
-        return self._imagine_from(self.features.inputs(batch), observed_values(batch, self.known), com)
+        features = self.compute_features(self.features.inputs(batch))
+        features = self.add_known(features, observed_values(batch, self.known))
+        seen = None
+        if observed:
+            unturned = np.broadcast_to([0.0, 0, 0, 1, 0, 0, 0], (observed, 7))
+            self._check_observed(unturned)
+            if (short := batch.length < observed).any():
+                raise PredictionError(
+                    f"interaction {batch.ids[short][0]} has {batch.length[short][0]} samples, fewer than the "
+                    f"{observed} to be observed: leave it out or observe fewer"
+                )
+            seen = encode_states(batch, self.state, batch.length)[:, :observed]
+        return self.imagine_effects(features, com, seen)
 
-    def _imagine_from(
-        self, inputs: Shaped[Tensor, "batch ..."], known: np.ndarray, com: np.ndarray
+    def imagine_effects(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        com: Float[np.ndarray, "batch 3"],
+        observed: Float[np.ndarray, "batch samples state"] | None = None,
     ) -> ImaginedBatch:
-        features = self.add_known(self.compute_features(inputs), known)
+        """Effects from what `add_known` gives, centres of mass at rest [m] and observed states."""
         states = self.imagine_states(features, rest_states(com, self.state))
-        pose = decode_poses(states) if self.state == "pose" else None
+        pose = None if self.state == "position" else decode_poses(states)
         return ImaginedBatch(self.times.cpu().numpy(), states[..., :3], pose)
+
+    def _check_observed(self, poses: Float[np.ndarray, "samples 7"]) -> Float[np.ndarray, "samples state"]:
+        """Observed poses as states."""
+        if type(self).imagine_effects is EffectPredictor.imagine_effects:
+            raise PredictionError(
+                f"the {self.label} predictor makes no use of observed samples: leave them out or use another one"
+            )
+        if poses.ndim != 2 or poses.shape[1] != 7 or not 1 <= len(poses) < self.num_samples:
+            raise PredictionError(
+                f"observed samples of shape {poses.shape}: give rows of 7 numbers, from 1 to {self.num_samples - 1}"
+            )
+        if not np.isfinite(poses).all():
+            raise PredictionError("an observed sample is not finite: leave out what comes from it on")
+        return np.concatenate(
+            [poses[:, :3], continuous_rotation_vectors(quaternion_to_matrix(poses[:, 3:]))], axis=1
+        )
 
     def compute_features(self, inputs: Shaped[Tensor, "batch ..."]) -> Float[Tensor, "batch features"]:
         """Features of prepared inputs, on the predictor's device, as they are outside training."""

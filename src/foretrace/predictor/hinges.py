@@ -1,4 +1,4 @@
-"""The edge that an object will turn about, and the lever-up as seen from there.
+"""The edges that an object may turn about, and the lever-up as seen from there.
 
 A lifted object turns about an edge of its footprint, nearly as on a hinge. Seen from there, lever-ups of different
 objects look alike: what matters is how far contact and centre of mass are from the hinge, and which way the blade
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 
 UNIT = 0.1
 """Lengths are divided by this to be of unit scale [m]."""
@@ -22,37 +23,68 @@ OUT_OF_SIGHT = 0.15
 """Positions along an edge are cut off this far from it [m]."""
 NUM_VALUES = 19
 """Numbers that describe a lever-up as seen from one hinge."""
+PROBES = 5
+"""Heights are read at this many places along either side of the rectangle about the hull."""
+MIRROR = (1.0, -1.0, 1.0)
+"""A vector seen in a mirror along the action axis."""
 
 
 @dataclass(frozen=True)
 class Hinges:
-    """The edges that objects are expected to turn about, each a frame of its own.
+    """The edges that objects may turn about, each a frame of its own; and those of their mirror images.
 
     The axes of that frame: out of the object, along the edge counter-clockwise, up. An object that turns outwards
-    over the edge turns about the second axis by a positive angle.
+    over the edge turns about the second axis by a positive angle. The second view is that of a mirror along the
+    action axis; its axes are mirrored back, so they are left-handed.
     """
 
-    values: Float[Tensor, "batch 19"]
+    values: Float[Tensor, "batch views hinges values"]
     """The lever-up as seen from there, of unit scale."""
-    axes: Float[Tensor, "batch 3 3"]
+    axes: Float[Tensor, "batch views hinges 3 3"]
     """Rows: the axes in the action frame."""
-    ends: Float[Tensor, "batch 2 2"]
-    """Ends of the edge in the action frame [m], the right one first as seen from inside."""
+    ends: Float[Tensor, "batch hinges 2 2"]
+    """Ends of the edges in the action frame [m], the right one first as seen from inside."""
 
 
-def find_hinges(corners: Float[Tensor, "batch corners 2"], com: Float[Tensor, "batch 3"]) -> Hinges:
-    """The edges crossed by the rays from lift point through centre of mass.
+def find_hinges(
+    corners: Float[Tensor, "batch corners 2"],
+    com: Float[Tensor, "batch 3"],
+    num_hinges: int = 2,
+    heights: Float[Tensor, "batch rows columns"] | None = None,
+) -> Hinges:
+    """The edges crossed by the rays from lift point through centre of mass, and their neighbours there.
 
-    The rule is that of `foretrace.features.support_points.support_points_by_rule`.
+    The first is the edge of `foretrace.features.support_points.support_points_by_rule`, the second the one beyond
+    the corner that the ray passes next to it.
 
     Args:
         corners: Corners of convex hulls in the action frame [m], counter-clockwise; the first one fills the row.
         com: Centres of mass at rest in the action frame [m].
+        num_hinges: 1 or 2.
+        heights: Height maps over the whole view [m], of any resolution. They add ``PROBES`` squared values.
     """
-    hull = _Hull(corners)
     lift = torch.stack([torch.full_like(com[:, 1], -SETBACK), HALF_WIDTH * com[:, 1].sign()], dim=1)
     ray = F.normalize(com[:, :2] - lift, dim=1)
-    return _see(hull, hull.crossed(lift, ray), com, lift, ray)
+    hull = _Hull(corners)
+    edges = hull.crossed(lift, ray, num_hinges)  # (batch, hinges)
+    images = (-edges - 1) % hull.count[:, None]
+    mirror = com.new_tensor(MIRROR)
+
+    def both(here: Tensor, there: Tensor) -> Tensor:
+        return torch.stack([here, there], dim=1).flatten(0, 1)  # (batch views, ...)
+
+    seen = _see(
+        _Hull(both(corners, mirror_corners(corners))),
+        both(edges, images),
+        both(com, com * mirror),
+        both(lift, lift * mirror[:2]),
+        both(ray, ray * mirror[:2]),
+    )
+    values, axes, ends = (part.unflatten(0, (len(com), 2)) for part in seen)
+    axes = torch.stack([axes[:, 0], axes[:, 1] * mirror], dim=1)
+    if heights is not None:
+        values = torch.cat([values, _probe(heights, corners, axes, ends[:, 0])], dim=-1)
+    return Hinges(values, axes, ends[:, 0])
 
 
 def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "batch corners 2"]:
@@ -60,7 +92,7 @@ def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "
     number = torch.arange(corners.shape[1], device=corners.device)
     count = _Hull(corners).count[:, None]
     order = torch.where(number < count, -number % count, 0)
-    return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor([1.0, -1.0])
+    return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor(MIRROR[:2])
 
 
 class _Hull:
@@ -73,70 +105,103 @@ class _Hull:
         self.there: Bool[Tensor, "batch corners"] = self.length > 1e-6
         self.count: Int[Tensor, " batch"] = self.there.sum(dim=1).clamp(min=1)
 
-    def step(self, edge: Int[Tensor, " batch"], by: Int[Tensor, " batch"] | int) -> Int[Tensor, " batch"]:
-        """The edge so many edges further on."""
-        return (edge + by) % self.count
+    def edges(self, edges: Int[Tensor, "batch edges"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Start (batch, edges, 2), direction (batch, edges, 2) and length (batch, edges)."""
+        edges = edges % self.count[:, None]
+        pairs = edges[..., None].expand(-1, -1, 2)
+        length = self.length.gather(1, edges).clamp(min=1e-6)
+        return self.start.gather(1, pairs), self.side.gather(1, pairs) / length[..., None], length
 
-    def edge(self, edge: Int[Tensor, " batch"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Start (batch, 2), direction (batch, 2) and length (batch,)."""
-        rows = torch.arange(len(edge), device=edge.device)
-        length = self.length[rows, edge].clamp(min=1e-6)
-        return self.start[rows, edge], self.side[rows, edge] / length[:, None], length
-
-    def crossed(self, lift: Tensor, ray: Tensor) -> Int[Tensor, " batch"]:
-        """The edge across which a ray leaves; the one furthest along it where there is none."""
+    def crossed(self, lift: Tensor, ray: Tensor, num: int) -> Int[Tensor, "batch edges"]:
+        """The edge across which a ray leaves (the one furthest along it where there is none), and a neighbour."""
         right = _cross(ray[:, None], self.start - lift[:, None])
         left = _cross(ray[:, None], self.start + self.side - lift[:, None])
         leaves = (right < 0) & (left >= 0) & self.there
         ahead = ((self.start + self.side / 2) * ray[:, None]).sum(dim=2)
-        return (ahead + 10 * leaves).masked_fill(~self.there, -torch.inf).argmax(dim=1)
+        edge = (ahead + 10 * leaves).masked_fill(~self.there, -torch.inf).argmax(dim=1, keepdim=True)
+        if num == 1:
+            return edge
+        # How far the ends of the edge are from the ray: the nearer one is where the neighbour begins.
+        from_start, from_end = (side.gather(1, edge).abs() for side in (right, left))
+        step = torch.where(from_end < from_start, 1, -1)
+        return torch.cat([edge, (edge + step) % self.count[:, None]], dim=1)
 
     def levered(self) -> tuple[Tensor, Tensor]:
-        """Where the edge nearest to the contact point starts and ends, measured along it from there (batch,)."""
+        """Where the edge nearest to the contact point starts and ends, measured along it from there (batch, 1)."""
         share = (-(self.start * self.side).sum(dim=2) / self.length.clamp(min=1e-6) ** 2).clamp(0, 1)
         distance = (self.start + share[..., None] * self.side).norm(dim=2).masked_fill(~self.there, torch.inf)
-        start, along, length = self.edge(distance.argmin(dim=1))
-        first = (start * along).sum(dim=1)
+        start, along, length = self.edges(distance.argmin(dim=1, keepdim=True))
+        first = (start * along).sum(dim=2)
         return first, first + length
 
 
-def _see(hull: _Hull, edge: Int[Tensor, " batch"], com: Tensor, lift: Tensor, ray: Tensor) -> Hinges:
-    """The lever-ups as seen from one edge each. Along it, positions count from the contact point."""
-    start, along, length = hull.edge(edge)
-    along_before, along_after = (hull.edge(hull.step(edge, by))[1] for by in (-1, 1))
-    out = torch.stack([along[:, 1], -along[:, 0]], dim=1)
+def _see(
+    hull: _Hull, edges: Int[Tensor, "batch hinges"], com: Tensor, lift: Tensor, ray: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The lever-ups as seen from edges. Along them, positions count from the contact point."""
+    start, along, length = hull.edges(edges)
+    along_before, along_after = (hull.edges(edges + by)[1] for by in (-1, 1))
+    out = torch.stack([along[..., 1], -along[..., 0]], dim=-1)
+    mass, lift, ray = com[:, None, :2], lift[:, None], ray[:, None]
 
     def ahead(normal: Tensor, point: Tensor) -> Tensor:
-        return (normal * point).sum(dim=1)
+        return (normal * point).sum(dim=-1)
 
-    mass = com[:, :2]
-    first, last, beside = ahead(along, start), ahead(along, start) + length, ahead(along, mass)
+    first, beside = ahead(along, start), ahead(along, mass)
+    last = first + length
     travel = (ahead(out, start) - ahead(out, lift)) / ahead(out, ray).clamp(min=0.02)
-    leaves = (ahead(along, lift) + travel * ahead(along, ray)).clamp(
-        first - OUT_OF_SIGHT, last + OUT_OF_SIGHT
-    )
+    leaves = ahead(along, lift) + travel * ahead(along, ray)
+    leaves = leaves.maximum(first - OUT_OF_SIGHT).minimum(last + OUT_OF_SIGHT)
     lengths = [
         # From contact, and from centre of mass, to the hinge; the centre of mass and the ends along it.
         *(ahead(out, start), ahead(out, start - mass), beside, first, last),
         # Where the ray leaves: along the hinge, from its ends, from the centre of mass.
         *(leaves, leaves - first, last - leaves, leaves - beside),
-        com[:, 2],
+        com[:, 2:].expand_as(length),
         # The edge that the blade goes under.
-        *(end.clamp(-OUT_OF_SIGHT, OUT_OF_SIGHT) for end in hull.levered()),
+        *(end.clamp(-OUT_OF_SIGHT, OUT_OF_SIGHT).expand_as(length) for end in hull.levered()),
     ]
     # How sharply the hull turns at the hinge's ends: at a blunt corner, its neighbour is nearly the same hinge.
     turns = [torch.atan2(_cross(a, b), ahead(a, b)) for a, b in ((along_before, along), (along, along_after))]
-    near = [torch.tanh(distance / NEAR_CORNER) for distance in (leaves - first, last - leaves)]
-    values = torch.stack(
-        [length / UNIT for length in lengths] + [out[:, 0], along[:, 0], *turns, *near], dim=1
+    values = torch.cat(
+        [
+            torch.stack(lengths, dim=-1) / UNIT,
+            torch.stack([out[..., 0], along[..., 0], *turns], dim=-1),
+            torch.tanh(torch.stack([leaves - first, last - leaves], dim=-1) / NEAR_CORNER),
+            com[:, 1:2].sign().expand_as(length)[..., None],
+        ],
+        dim=-1,
     )
-    values = torch.cat([values, mass[:, 1:].sign()], dim=1)
     flat, up = torch.zeros_like(length), torch.ones_like(length)
-    axes = [torch.cat([a, flat[:, None]], dim=1) for a in (out, along)] + [
-        torch.stack([flat, flat, up], dim=1)
-    ]
-    ends = torch.stack([start, start + along * length[:, None]], dim=1)
-    return Hinges(values, torch.stack(axes, dim=1), ends)
+    axes = torch.stack(
+        [
+            torch.cat([out, flat[..., None]], dim=-1),
+            torch.cat([along, flat[..., None]], dim=-1),
+            torch.stack([flat, flat, up], dim=-1),
+        ],
+        dim=-2,
+    )
+    return values, axes, torch.stack([start, start + along * length[..., None]], dim=-2)
+
+
+def _probe(
+    heights: Float[Tensor, "batch rows columns"],
+    corners: Float[Tensor, "batch corners 2"],
+    axes: Float[Tensor, "batch views hinges 3 3"],
+    ends: Float[Tensor, "batch hinges 2 2"],
+) -> Float[Tensor, "batch views hinges probes"]:
+    """Heights on a grid over the rectangle about the hull with sides along the hinge, of unit scale."""
+    sides = axes[..., :2, :2]  # rows: out of the object, along the edge
+    reach = corners[:, None, None] @ sides.mT  # (batch, views, hinges, corners, 2)
+    low, high = reach.amin(dim=-2), reach.amax(dim=-2)
+    share = (torch.arange(PROBES, dtype=low.dtype, device=low.device) + 0.5) / PROBES
+    grid = torch.stack(torch.meshgrid(share, share, indexing="ij"), dim=-1).flatten(0, 1)
+    points = (low[..., None, :] + (high - low)[..., None, :] * grid) @ sides
+    # Positions in the picture, from -1 to 1 between its borders; columns first.
+    pixels = points.new_tensor(CONTACT_PIXEL) - points / METRES_PER_PIXEL
+    places = ((2 * pixels + 1) / VIEW_SIZE - 1).flip(-1).flatten(1, 2)
+    found = F.grid_sample(heights[:, None], places, align_corners=False)
+    return found[:, 0].unflatten(1, axes.shape[1:3]) / UNIT
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

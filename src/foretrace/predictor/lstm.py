@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from foretrace.features import FeatureExtractor, Precision
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.states import StateKind, state_size
+from foretrace.predictor.states import Effects, StateKind, state_size
 
 CHANGE_SCALE = 0.1
 """Normalised states change by about this much in one sample: the dense layer's numbers stay of unit scale."""
@@ -217,17 +217,13 @@ class LstmPredictor(EffectPredictor):
         super().set_precision(precision)
         self.lstm.precision = precision
 
-    def training_loss(
-        self,
-        features: Float[Tensor, "batch inputs"],
-        states: Float[Tensor, "batch time state"],
-        lengths: Int[Tensor, " batch"],
-    ) -> Float[Tensor, ""]:
+    def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
         """Mean squared error of every step's n predicted states, window by window, given recorded states.
 
         The memory that a window leaves is where the next one starts, as in a roll-out: an LSTM that started
         anew in the middle of a trajectory could not tell how long an object at rest has been at rest.
         """
+        states, lengths = effects.states, effects.lengths
         time = states.shape[1]
         ahead = self._config.steps_ahead
         projected = self.lstm.project(features)

@@ -1,7 +1,8 @@
-"""A predictor that says the whole motion at once: how the object turns about its support edge."""
+"""A predictor that says whole motions at once, what may happen instead, and how sure it is."""
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,16 +12,34 @@ from torch.nn import functional as F
 
 from foretrace.errors import TrainingError
 from foretrace.features import FeatureExtractor, Outline
-from foretrace.features.outline import UNIT
-from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.hinges import NUM_VALUES, find_hinges, mirror_corners
+from foretrace.features.outline import HEIGHT_CELLS, MAX_CORNERS, UNIT
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.record import Outcome
+from foretrace.predictor.base import EffectPredictor, ImaginedBatch
+from foretrace.predictor.futures import (
+    COORDINATES,
+    LEVELS,
+    TURN_LENGTH,
+    Futures,
+    Mixture,
+    along_hinges,
+    conformal_scores,
+    no_observations,
+    quantiles_of,
+)
+from foretrace.predictor.hinges import NUM_VALUES, PROBES, Hinges, find_hinges
+from foretrace.predictor.states import Effects, decode_poses
 
-COORDINATES = 6
-"""A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes."""
-TURN_LENGTH = 0.05
-"""A turn by 1 rad weighs as much as a displacement by this [m]: about the distance from hinge to centre of mass."""
+ODD = (1, 3, 5)
+"""Coordinates of a motion that change their sign in a mirror: along the hinge; turns about the other two axes."""
 TURN_WEIGHT = 0.5
 """Weight of the turn in the loss, beside 1 for the displacement."""
+TEMPERATURE = 0.003
+"""Of two futures, one that is this much nearer to what happened [m] counts e times as much in training."""
+SURENESS_WEIGHT = 0.02
+"""Weight of the error of the expected error in the loss."""
+FEW = 10
+"""So many lever-ups with an outcome tell how much they scatter."""
 SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step looks at: it makes the step cheaper."""
 
@@ -29,7 +48,7 @@ SAMPLES_PER_STEP = 15
 class OneShotConfig:
     """Settings of the predictor of whole motions."""
 
-    hidden: int = 192
+    hidden: int = 128
     """Units of each hidden layer."""
     layers: int = 3
     """Hidden layers."""
@@ -37,13 +56,24 @@ class OneShotConfig:
     """Networks that learn side by side and are averaged."""
     motions: int = 32
     """Principal motions of the training part that the networks put a trajectory together from."""
+    hinges: int = 2
+    """Edges that it considers: the one ahead of the centre of mass, and its neighbour."""
     known: tuple[str, ...] = ()
     """Physical constants that it is told beside the view."""
+    outcomes: tuple[str, ...] = ("levered",)
+    """Outcomes that it tells apart; each has a future of its own."""
 
     def __post_init__(self) -> None:
         for name in ("hidden", "layers", "members", "motions"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.hinges not in (1, 2):
+            raise TrainingError(f"hinges must be 1 or 2, not {self.hinges}")
+        for name in self.outcomes:
+            if name not in list(Outcome):
+                raise TrainingError(f"unknown outcome {name!r}; choose from {', '.join(Outcome)}")
+        if not self.outcomes:
+            raise TrainingError("there is no outcome to learn: name at least one")
 
 
 class Members(nn.Module):
@@ -77,23 +107,25 @@ class Members(nn.Module):
         return x
 
 
-@dataclass(frozen=True)
-class _View:
-    """Lever-ups as seen from their hinges, or as their mirror images are seen from theirs."""
+class Said(NamedTuple):
+    """What the members say about lever-ups and their mirror images, hinge by hinge and outcome by outcome."""
 
-    values: Float[Tensor, "batch values"]
-    """What is seen, of unit scale."""
-    axes: Float[Tensor, "batch 3 3"]
-    """Rows: the hinge's axes in the action frame; of a mirror image's hinge, mirrored back."""
+    weights: Float[Tensor, "members batch views hinges outcomes motions"]
+    """Of the principal motions."""
+    error: Float[Tensor, "members batch views hinges outcomes"]
+    """Logarithm of the error that is to be expected of the motion, in units of the position's scale."""
+    odds: Float[Tensor, "members batch views hinges outcomes"]
+    """Logarithm of the probability, up to a constant."""
 
 
 class OneShotPredictor(EffectPredictor):
-    """Says a whole motion at once, in the frame of the edge that the object turns about.
+    """Says whole motions at once, in the frames of the edges that the object may turn about.
 
-    From the outline's corners and the centre of mass, `find_hinges` finds the support edge in closed form, and
-    what the lever-up looks like from there. Networks turn these numbers into weights of principal motions: how far
-    the object is displaced and turned, sample by sample, along the hinge's axes. Every lever-up is also seen in the
-    mirror, and both answers are averaged: mirror images have mirrored motions, exactly.
+    From the outline's corners and the centre of mass, `find_hinges` finds two edges in closed form, and what the
+    lever-up looks like from there. For every edge and every outcome networks turn these numbers into a future: its
+    probability; the weights of principal motions (how far the object is displaced and turned, sample by sample,
+    along the hinge's axes); and the error to be expected. Futures are never averaged, only what several networks
+    say about the same one. Every lever-up is also seen in the mirror: mirror images have mirrored motions, exactly.
 
     Args:
         features: Must be ``outline``.
@@ -109,6 +141,9 @@ class OneShotPredictor(EffectPredictor):
     value_scale: Tensor
     mean_motion: Tensor
     motions: Tensor
+    parity: Tensor
+    covariance: Tensor
+    quantiles: Tensor
 
     def __init__(
         self, features: FeatureExtractor, num_samples: int, settings: OneShotConfig = OneShotConfig()
@@ -118,15 +153,19 @@ class OneShotPredictor(EffectPredictor):
                 f"the {self.label} predictor reads an object's outline, not {features.label}: train it with "
                 "features 'outline'"
             )
-        super().__init__(features, "pose", num_samples, settings.known)
+        super().__init__(features, "turn", num_samples, settings.known, settings.outcomes)
         self.settings = settings
+        self.heights = features.heights
+        seen, outcomes, motions = NUM_VALUES + self.heights * PROBES**2, len(self.outcomes), settings.motions
         hidden = (settings.hidden,) * settings.layers
-        enter = NUM_VALUES + len(self.known)
-        self.networks = Members(settings.members, (enter, *hidden, settings.motions))
-        self.register_buffer("value_mean", torch.zeros(NUM_VALUES))
-        self.register_buffer("value_scale", torch.ones(NUM_VALUES))
+        self.networks = Members(settings.members, (seen + len(self.known), *hidden, outcomes * (motions + 2)))
+        self.register_buffer("value_mean", torch.zeros(seen))
+        self.register_buffer("value_scale", torch.ones(seen))
         self.register_buffer("mean_motion", torch.zeros(num_samples, COORDINATES))
-        self.register_buffer("motions", torch.zeros(settings.motions, num_samples, COORDINATES))
+        self.register_buffer("motions", torch.zeros(motions, num_samples, COORDINATES))
+        self.register_buffer("parity", torch.ones(motions))
+        self.register_buffer("covariance", torch.eye(motions).repeat(outcomes, 1, 1))
+        self.register_buffer("quantiles", torch.ones(len(LEVELS)))
 
     @property
     def config(self) -> OneShotConfig:
@@ -138,121 +177,218 @@ class OneShotPredictor(EffectPredictor):
         """None: corners are not multiplied with weights, only what is made of them."""
         return []
 
-    def prepare(
-        self,
-        features: Float[Tensor, "batch inputs"],
-        states: Float[Tensor, "batch time 9"],
-        lengths: Int[Tensor, " batch"],
-    ) -> None:
+    def lengths(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
+        """Whole trajectories: what follows a slip is an effect too."""
+        return batch.length
+
+    def prepare(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
         """Find the principal motions of the training part, and the scale of what is seen from the hinges.
 
-        A shorter trajectory counts as if it stayed where it ends.
+        A shorter trajectory counts as if it stayed where it ends. Principal motions are found apart for what stays
+        the same in a mirror and what changes its sign, so each is its own mirror image, up to its sign.
         """
-        com = self._metres(states[:, :1, :3])
-        views = self._see(features, com[:, 0])
-        values = torch.cat([view.values for view in views])
+        hinges = self._see(features, self._com(effects.states))
+        values = hinges.values.flatten(0, 2)
         self.value_mean.copy_(values.mean(dim=0))
         self.value_scale.copy_(values.std(dim=0, correction=0).clamp(min=1e-3))
-        held = torch.arange(states.shape[1], device=states.device).expand(len(states), -1)
-        held = held.minimum(lengths[:, None] - 1)[..., None].expand_as(states)
-        states = states.gather(1, held)
-        motions = torch.cat([self._motion(states, com, view) for view in views])
-        self.mean_motion.copy_(motions.mean(dim=0))
-        _, sizes, directions = torch.linalg.svd((motions - self.mean_motion).flatten(1), full_matrices=False)
-        found = min(len(sizes), len(self.motions))
-        scaled = directions[:found] * (sizes[:found, None] / len(motions) ** 0.5)
-        self.motions[:found].copy_(scaled.unflatten(1, self.mean_motion.shape))
+        moved = along_hinges(hinges.axes[:, 0, 0], self._motion(self._held(effects)))  # (batch, time, 6)
+        odd = torch.isin(torch.arange(COORDINATES), torch.tensor(ODD)).to(moved)
+        self.mean_motion.copy_(moved.mean(dim=0) * (1 - odd))
+        found = []
+        for parity, part in ((1.0, 1 - odd), (-1.0, odd)):
+            deviation = ((moved - self.mean_motion) * part).flatten(1)
+            _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
+            found += [
+                (float(s), parity, d) for s, d in zip(sizes / len(moved) ** 0.5, directions, strict=True)
+            ]
+        found.sort(key=lambda motion: -motion[0])
+        for k, (size, parity, direction) in enumerate(found[: len(self.motions)]):
+            self.motions[k] = size * direction.view_as(self.mean_motion)
+            self.parity[k] = parity
 
-    def training_loss(
-        self,
-        features: Float[Tensor, "batch inputs"],
-        states: Float[Tensor, "batch time 9"],
-        lengths: Int[Tensor, " batch"],
-    ) -> Float[Tensor, ""]:
-        """Mean distance of displacements, and of turns by ``TURN_WEIGHT``, in units of the normalised position.
+    def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
+        """Negative logarithm of the likelihood of what happened, in units of the normalised position.
 
-        Distances, not their squares: one lever-up that goes another way does not outweigh all others.
+        The likelihood falls exponentially with the mean distance of displacements, and of turns by ``TURN_WEIGHT``,
+        and is summed over hinges. Distances, not their squares: one lever-up that goes another way does not
+        outweigh all others.
         """
-        com = self._metres(states[:, :1, :3])
-        views = self._see(features, com[:, 0])
-        time = torch.randperm(states.shape[1], device=states.device)[:SAMPLES_PER_STEP]
-        valid = (time < lengths[:, None]).float().repeat(len(views), 1)
-        truth = torch.cat([self._motion(states[:, time], com, view) for view in views])
-        off = self._say(features, views, time) - truth  # (members, views batch, time, 6)
-        apart = off.unflatten(-1, (2, 3)).square().sum(dim=-1).add(1e-12).sqrt()
-        error = apart[..., 0] + TURN_WEIGHT * apart[..., 1]
-        return (error * valid).sum() / (len(error) * valid.sum()) / self.state_scale[0]
+        scale = self.state_scale[0]
+        hinges = self._see(features, self._com(effects.states))
+        said = self._say(features, hinges)
+        time = torch.randperm(effects.states.shape[1], device=self.device)[:SAMPLES_PER_STEP]
+        chosen = effects.outcomes[None, :, None, None, None].expand(*said.odds.shape[:4], 1)
+        weights = said.weights.gather(4, chosen[..., None].expand(*chosen.shape, said.weights.shape[-1]))
+        motion = (weights[..., 0, :] @ self.motions[:, time].flatten(1)).unflatten(-1, (-1, COORDINATES))
+        # The motion at rest; its states were normalised and shifted, so the first sample has to come along.
+        states = torch.cat([effects.states[:, :1], effects.states[:, time]], dim=1)
+        truth = along_hinges(hinges.axes, self._motion(states)[:, 1:])
+        apart = (motion + self.mean_motion[time] - truth).unflatten(-1, (2, 3)).square().sum(dim=-1)
+        apart = apart.add(1e-12).sqrt() @ apart.new_tensor(
+            [1.0, TURN_WEIGHT]
+        )  # (members, batch, views, hinges, time)
+        valid = (time < effects.lengths[:, None]).float()
+        error = (apart * valid[:, None, None]).sum(dim=-1) / valid.sum(dim=-1).clamp(min=1)[:, None, None]
+        odds = said.odds.flatten(3).log_softmax(dim=-1).view_as(said.odds).gather(4, chosen)[..., 0]
+        likelihood = odds - error / TEMPERATURE
+        expected = said.error.gather(4, chosen)[..., 0]
+        share = likelihood.softmax(dim=-1).detach()
+        off = (error / scale).detach().clamp(min=1e-6)
+        sureness = (share * (expected + off * torch.exp(-expected))).sum(dim=-1)
+        seen = valid.any(dim=-1).float()[:, None]  # of a short trajectory there may be no sample among them
+        loss = SURENESS_WEIGHT * sureness - TEMPERATURE / scale * likelihood.logsumexp(dim=-1)
+        return (loss * seen).mean() / seen.mean().clamp(min=1e-6)
 
-    def validation_loss(self, off: Float[np.ndarray, "samples 9"]) -> float:
+    def validation_loss(self, off: Float[np.ndarray, "samples state"]) -> float:
         """The mean distance of positions, as in training; its square would be that of the few worst."""
         return float(np.mean(np.linalg.norm(off[:, :3], axis=1)))
 
+    def finish(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        effects: Effects,
+        other_features: Float[Tensor, "other inputs"],
+        other_effects: Effects,
+    ) -> None:
+        """Measure how motions scatter about those expected, and how wide regions have to be.
+
+        Which errors go together is taken from the training part. How large they are is taken from the validation
+        part, and so are the widths of regions (split-conformal prediction).
+        """
+        scatter, other_scatter = (
+            self._scatter(features, effects),
+            self._scatter(other_features, other_effects),
+        )
+        for outcome in range(len(self.outcomes)):
+            mine, others = (
+                scatter[effects.outcomes == outcome],
+                other_scatter[other_effects.outcomes == outcome],
+            )
+            mine = mine if len(mine) else scatter
+            covariance = mine.mT @ mine / len(mine)
+            ridge = 1e-3 * covariance.diagonal().mean() + 1e-12
+            covariance = covariance + ridge * torch.eye(len(covariance)).to(covariance)
+            if len(others) >= FEW:
+                root = torch.linalg.cholesky(covariance)
+                white = torch.linalg.solve_triangular(root, others.mT, upper=False)
+                covariance = covariance * white.square().mean()
+            self.covariance[outcome] = covariance
+        com = self._com(other_effects.states)
+        futures = self._futures(self.mixture(other_features, com))
+        truth = self._metres(other_effects.states).double().cpu().numpy()
+        scores = conformal_scores(futures, truth, other_effects.lengths.cpu().numpy())
+        self.quantiles.copy_(torch.from_numpy(quantiles_of(scores)))
+
     def roll_out(
-        self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch 9"]
-    ) -> Float[Tensor, "batch time 9"]:
-        """Whole motions from the view and the centre of mass at rest: the mean over members and mirror images."""
-        com = self._metres(first[:, None, :3])
-        views = self._see(features, com[:, 0])
-        said = self._say(features, views, torch.arange(self.num_samples, device=first.device))
-        said = said.unflatten(1, (len(views), len(first)))  # (members, views, batch, time, 6)
-        axes = torch.stack([view.axes for view in views])[:, :, None]  # (views, batch, 1, 3, 3)
-        displaced = (said[..., None, :3] @ axes)[..., 0, :].mean(dim=(0, 1))
-        rotation = (axes.mT @ rotation_matrix(said[..., 3:] / TURN_LENGTH) @ axes).mean(dim=(0, 1))
-        columns = rotation[..., :2].transpose(-1, -2).flatten(-2)
-        return (torch.cat([com + displaced, columns], dim=-1) - self.state_mean) / self.state_scale
+        self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
+    ) -> Float[Tensor, "batch time state"]:
+        """The most probable of the whole motions, from the view and the centre of mass at rest."""
+        states = self.mixture(features, self._com(first[:, None])).most_probable()
+        return (states - self.state_mean) / self.state_scale
 
-    def _metres(self, positions: Float[Tensor, "batch time 3"]) -> Float[Tensor, "batch time 3"]:
-        return positions * self.state_scale[:3] + self.state_mean[:3]
+    def imagine_effects(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        com: Float[np.ndarray, "batch 3"],
+        observed: Float[np.ndarray, "batch samples state"] | None = None,
+    ) -> ImaginedBatch:
+        """As the base class; with all futures."""
+        with torch.no_grad():
+            start = torch.as_tensor(com, dtype=torch.float32, device=self.device)
+            mixture = self.mixture(features, start)
+            if observed is not None:
+                mixture = mixture.given(torch.as_tensor(observed, dtype=torch.float32, device=self.device))
+            futures = self._futures(mixture)
+        rows, best = np.arange(len(com)), futures.probability.argmax(axis=1)
+        return ImaginedBatch(
+            self.times.cpu().numpy(), futures.com[rows, best], futures.pose[rows, best], futures
+        )
 
-    def _see(self, features: Float[Tensor, "batch inputs"], com: Float[Tensor, "batch 3"]) -> list[_View]:
-        """The lever-ups, and their mirror images about the action axis."""
-        corners = features[:, : self.features.num_features].unflatten(1, (-1, 2)) * UNIT
-        mirror = com.new_tensor([1.0, -1.0, 1.0])
-        seen, mirrored = find_hinges(corners, com), find_hinges(mirror_corners(corners), com * mirror)
-        return [_View(seen.values, seen.axes), _View(mirrored.values, mirrored.axes * mirror)]
+    # --- what the networks say ----------------------------------------------------------------------------
 
-    def _motion(
-        self, states: Float[Tensor, "batch time 9"], com: Float[Tensor, "batch 1 3"], view: _View
-    ) -> Float[Tensor, "batch time 6"]:
-        """States as displacements and turns along the axes of a view [m]."""
-        columns = (states[..., 3:] * self.state_scale[3:] + self.state_mean[3:]).unflatten(-1, (2, 3))
-        rotation = torch.stack([*columns.unbind(-2), torch.linalg.cross(*columns.unbind(-2))], dim=-1)
-        axes = view.axes[:, None]
-        displaced = (axes @ (self._metres(states[..., :3]) - com)[..., None])[..., 0]
-        return torch.cat([displaced, TURN_LENGTH * rotation_vector(axes @ rotation @ axes.mT)], dim=-1)
+    def _see(self, features: Float[Tensor, "batch inputs"], com: Float[Tensor, "batch 3"]) -> Hinges:
+        corners = features[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2)) * UNIT
+        heights = None
+        if self.heights:
+            heights = features[:, 2 * MAX_CORNERS : self.features.num_features] * UNIT
+            heights = heights.unflatten(1, (HEIGHT_CELLS, HEIGHT_CELLS))
+        return find_hinges(corners, com, self.settings.hinges, heights)
 
-    def _say(
-        self, features: Float[Tensor, "batch inputs"], views: list[_View], time: Int[Tensor, " time"]
-    ) -> Float[Tensor, "members seen time 6"]:
-        """Every member's answer to every view, one view after the other, at the given samples [m]."""
-        values = (torch.cat([view.values for view in views]) - self.value_mean) / self.value_scale
-        known = features[:, self.features.num_features :].repeat(len(views), 1)
-        rows = torch.cat([values, known], dim=1).expand(self.settings.members, -1, -1)
-        motions = self.motions[:, time]
-        said = self.networks(rows) @ motions.flatten(1)
-        return said.unflatten(-1, motions.shape[1:]) + self.mean_motion[time]
+    def _say(self, features: Float[Tensor, "batch inputs"], hinges: Hinges) -> Said:
+        values = (hinges.values - self.value_mean) / self.value_scale
+        if self.known:
+            known = features[:, None, None, self.features.num_features :]
+            values = torch.cat([values, known.expand(*values.shape[:-1], -1)], dim=-1)
+        rows = values.flatten(0, 2).expand(self.settings.members, -1, -1)
+        said = self.networks(rows).unflatten(1, values.shape[:3]).unflatten(-1, (len(self.outcomes), -1))
+        return Said(said[..., :-2], said[..., -2], said[..., -1])
 
+    def mixture(self, features: Float[Tensor, "batch inputs"], com: Float[Tensor, "batch 3"]) -> Mixture:
+        """What members and mirror images say about each future, averaged."""
+        hinges = self._see(features, com)
+        said = self._say(features, hinges)
+        weights, error = said.weights.mean(dim=0), said.error.mean(dim=(0, 2)).exp() * self.state_scale[0]
+        odds = said.odds.flatten(3).log_softmax(dim=-1).view_as(said.odds).mean(dim=(0, 2))
+        return Mixture(
+            com=com,
+            axes=hinges.axes[:, 0],
+            ends=hinges.ends,
+            odds=odds.flatten(1).log_softmax(dim=1).view_as(odds),
+            mean=(weights[:, 0] + self.parity * weights[:, 1]) / 2,
+            factor=error[..., None, None] * torch.linalg.cholesky(self.covariance),
+            motions=self.motions,
+            mean_motion=self.mean_motion,
+            observed=no_observations(com),
+        )
 
-def rotation_vector(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Axis times angle [rad] of rotation matrices; near half a turn the axis loses its digits."""
-    twice = torch.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        dim=-1,
-    )
-    sine = twice.norm(dim=-1, keepdim=True)
-    cosine = rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1
-    return twice * torch.where(sine > 1e-6, torch.atan2(sine, cosine) / sine.clamp(min=1e-6), 0.5)
+    def _futures(self, mixture: Mixture) -> Futures:
+        states = mixture.states().double().cpu().numpy()
+        ends = mixture.ends[:, :, None].expand(*mixture.odds.shape, 2, 2).flatten(1, 2)
+        return Futures(
+            probability=mixture.odds.flatten(1).exp().double().cpu().numpy(),
+            outcome=self.outcomes * self.settings.hinges,
+            com=states[..., :3],
+            pose=decode_poses(states),
+            spread=mixture.spread().double().cpu().numpy(),
+            support_points=ends.double().cpu().numpy(),
+            quantiles=self.quantiles.double().cpu().numpy(),
+        )
 
+    def _scatter(
+        self, features: Float[Tensor, "batch inputs"], effects: Effects
+    ) -> Float[Tensor, "batch motions"]:
+        """Errors of the weights of motions, relative to what was expected, at the better hinge."""
+        mixture = self.mixture(features, self._com(effects.states))
+        truth = along_hinges(mixture.axes, self._motion(self._held(effects))).flatten(2)
+        rows = torch.arange(len(effects), device=self.device)
+        mean = mixture.mean[rows, :, effects.outcomes]  # (batch, hinges, motions)
+        motions = self.motions.flatten(1)
+        off = truth - self.mean_motion.flatten() - mean @ motions
+        better = off.square().sum(dim=2).argmin(dim=1)
+        weights = off[rows, better] @ motions.mT / motions.square().sum(dim=1).clamp(min=1e-12)
+        # The factor of a unit covariance would be the expected error.
+        said = (
+            mixture.factor[rows, better, effects.outcomes, 0, 0]
+            / torch.linalg.cholesky(self.covariance)[effects.outcomes, 0, 0]
+        )
+        return weights / said[:, None]
 
-def rotation_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of axes times angles [rad] (Rodrigues)."""
-    angle = vector.norm(dim=-1)[..., None, None]
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    sine, versine = torch.sinc(angle / torch.pi), torch.sinc(angle / (2 * torch.pi)) ** 2 / 2
-    return torch.eye(3, device=vector.device) + sine * skew + versine * skew @ skew
+    # --- from states to motions ---------------------------------------------------------------------------
+
+    def _metres(self, states: Float[Tensor, "batch time state"]) -> Float[Tensor, "batch time 3"]:
+        return states[..., :3] * self.state_scale[:3] + self.state_mean[:3]
+
+    def _com(self, states: Float[Tensor, "batch time state"]) -> Float[Tensor, "batch 3"]:
+        return self._metres(states[:, :1])[:, 0]
+
+    def _motion(self, states: Float[Tensor, "batch time state"]) -> Float[Tensor, "batch time 6"]:
+        """Displacement since the first sample, and turn, in the action frame [m]."""
+        positions = self._metres(states)
+        turned = states[..., 3:] * self.state_scale[3:] + self.state_mean[3:]
+        return torch.cat([positions - positions[:, :1], TURN_LENGTH * turned], dim=-1)
+
+    def _held(self, effects: Effects) -> Float[Tensor, "batch time state"]:
+        """States; past the end of a shorter trajectory those at its end."""
+        time = torch.arange(effects.states.shape[1], device=self.device)
+        held = time.expand(len(effects), -1).minimum(effects.lengths[:, None] - 1)
+        return effects.states.gather(1, held[..., None].expand_as(effects.states))

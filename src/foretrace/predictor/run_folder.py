@@ -21,7 +21,7 @@ from foretrace.errors import TrainingError
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.checkpoint import CONFIG, MODEL, describe, load_tensors, read_config
+from foretrace.predictor.checkpoint import CONFIG, MODEL, describe, load_tensors, read_config, read_tensors
 from foretrace.predictor.files import write_json, write_tensors, write_text
 
 ENVIRONMENT = "environment.json"
@@ -164,7 +164,16 @@ class RunFolder:
         optimizer.load_state_dict(optimizer.state_dict() | {"state": state})
         return progress
 
-    def finish(self) -> None:
+    @property
+    def model(self) -> dict[str, Tensor]:
+        """The best model."""
+        return read_tensors(self.path / MODEL)
+
+    def finish(self, predictor: EffectPredictor) -> None:
+        """Keep the finished predictor in place of the best model."""
+        write_tensors(self.path / MODEL, predictor.state_dict())
+
+    def close(self) -> None:
         """Declare the training finished."""
         (self.path / RESUME).unlink(missing_ok=True)
 

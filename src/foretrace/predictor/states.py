@@ -1,18 +1,46 @@
 """What a predictor's state is made of, and the way from recorded trajectories to states and back."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_6d, rotation_from_6d
+from foretrace.geometry import (
+    continuous_rotation_vectors,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    rotation_6d,
+    rotation_from_6d,
+    rotation_vector_to_quaternion,
+)
 from foretrace.interactions.dataset import InteractionBatch
 
-StateKind = Literal["position", "pose"]
-"""``position``: the centre of mass. ``pose``: the centre of mass and the rotation since rest (6-D)."""
+StateKind = Literal["position", "pose", "turn"]
+"""``position``: the centre of mass. ``pose``: the centre of mass and the rotation since rest (6-D). ``turn``: the same
+with the rotation as axis times angle, which grows beyond half a turn where an object rolls on."""
 
-STATE_GROUPS: dict[StateKind, tuple[int, ...]] = {"position": (3,), "pose": (3, 6)}
+STATE_GROUPS: dict[StateKind, tuple[int, ...]] = {"position": (3,), "pose": (3, 6), "turn": (3, 3)}
 """Sizes of the parts of a state that share one unit, and therefore one scale."""
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What happened in interactions, as learned from."""
+
+    states: Float[Tensor, "batch time state"]
+    """Normalised states; zeros past the end of a shorter trajectory."""
+    lengths: Int[Tensor, " batch"]
+    """Samples of each trajectory that count."""
+    outcomes: Int[Tensor, " batch"]
+    """Which of the outcomes that the predictor tells apart became of each."""
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __getitem__(self, rows: Tensor) -> "Effects":
+        return Effects(self.states[rows], self.lengths[rows], self.outcomes[rows])
 
 
 def state_size(kind: StateKind) -> int:
@@ -25,25 +53,29 @@ def valid_lengths(batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
     return np.minimum(batch.length, batch.slip_index)
 
 
-def valid_samples(batch: InteractionBatch) -> np.ndarray:
-    """(batch, time) bool: whether a sample lies within its trajectory's valid length."""
-    return np.arange(batch.com.shape[1]) < valid_lengths(batch)[:, None]
+def valid_samples(
+    batch: InteractionBatch, lengths: Int[np.ndarray, " batch"] | None = None
+) -> Bool[np.ndarray, "batch time"]:
+    """Whether a sample lies within its trajectory's length, by default the valid one."""
+    return np.arange(batch.com.shape[1]) < (valid_lengths(batch) if lengths is None else lengths)[:, None]
 
 
-def encode_states(batch: InteractionBatch, kind: StateKind) -> Float[np.ndarray, "batch time state"]:
-    """Recorded trajectories as states in the action frame [m]; zeros past the valid length.
+def encode_states(
+    batch: InteractionBatch, kind: StateKind, lengths: Int[np.ndarray, " batch"] | None = None
+) -> Float[np.ndarray, "batch time state"]:
+    """Recorded trajectories as states in the action frame [m]; zeros past their length, by default the valid one.
 
-    The rotation of a ``pose`` state is the object's rotation since rest, the same whatever the object frame:
-    the identity in the first sample.
+    The rotation is the object's since rest, the same whatever the object frame: none in the first sample.
     """
     states = batch.com
-    valid = valid_samples(batch)
-    if kind == "pose":
+    valid = valid_samples(batch, lengths)
+    if kind != "position":
         # Unit quaternions in place of the missing: a rotation matrix cannot be made from NaN.
         quaternions = np.where(valid[..., None], batch.pose[..., 3:], batch.pose[:, :1, 3:])
         rotations = quaternion_to_matrix(quaternions)
         since_rest = rotations @ np.swapaxes(rotations[:, :1], -1, -2)  # (batch, time, 3, 3)
-        states = np.concatenate([states, rotation_6d(since_rest)], axis=-1)
+        turned = rotation_6d(since_rest) if kind == "pose" else continuous_rotation_vectors(since_rest)
+        states = np.concatenate([states, turned], axis=-1)
     return np.where(valid[..., None], states, 0.0)
 
 
@@ -51,13 +83,17 @@ def rest_states(com: Float[np.ndarray, "batch 3"], kind: StateKind) -> Float[np.
     """States of objects at rest with their centres of mass at ``com`` in the action frame [m]."""
     if kind == "position":
         return com
-    identity = rotation_6d(np.broadcast_to(np.eye(3), (len(com), 3, 3)))
-    return np.concatenate([com, identity], axis=-1)
+    unturned = rotation_6d(np.eye(3)) if kind == "pose" else np.zeros(3)
+    return np.concatenate([com, np.broadcast_to(unturned, (len(com), len(unturned)))], axis=-1)
 
 
-def decode_poses(states: Float[np.ndarray, "*batch 9"]) -> Float[np.ndarray, "*batch 7"]:
-    """``pose`` states as centre of mass [m] and quaternion (w, x, y, z) of the rotation since rest."""
-    quaternions = matrix_to_quaternion(rotation_from_6d(states[..., 3:]))
+def decode_poses(states: Float[np.ndarray, "*batch state"]) -> Float[np.ndarray, "*batch 7"]:
+    """``pose`` or ``turn`` states as centre of mass [m] and quaternion (w, x, y, z) of the rotation since rest."""
+    turned = states[..., 3:]
+    if turned.shape[-1] == 3:
+        quaternions = rotation_vector_to_quaternion(turned)
+    else:
+        quaternions = matrix_to_quaternion(rotation_from_6d(turned))
     return np.concatenate([states[..., :3], quaternions], axis=-1)
 
 

@@ -30,8 +30,8 @@ from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
 from foretrace.predictor.states import (
+    Effects,
     StateKind,
-    encode_states,
     state_statistics,
     valid_lengths,
     valid_samples,
@@ -102,7 +102,9 @@ class TrainConfig:
         """The untrained predictor that these settings ask for."""
         features = make_features(self.features, **self.feature_options)
         if self.predictor == OneShotPredictor.label:
-            return OneShotPredictor(features, num_samples, OneShotConfig(self.hidden, known=self.known))
+            return OneShotPredictor(
+                features, num_samples, OneShotConfig(self.hidden, known=self.known, outcomes=self.outcomes)
+            )
         settings = LstmConfig(
             self.state, self.steps_ahead, self.hidden, self.window, self.residual, self.known
         )
@@ -119,7 +121,9 @@ class _Part:
     known: np.ndarray
     """(batch, known) constants that the predictor is told [SI]."""
     states: np.ndarray
-    """(batch, time, state) in the action frame [m], zeros past the valid length."""
+    """(batch, time, state) in the action frame [m], zeros past the length."""
+    valid: np.ndarray
+    """(batch, time) bool: the samples within it."""
 
 
 def fit_predictor(
@@ -135,7 +139,7 @@ def fit_predictor(
 
     Args:
         batch: The interactions.
-        config: Settings; its ``split`` and ``outcomes`` are not looked at.
+        config: Settings; its ``split`` is not looked at, and its ``outcomes`` only by predictors that tell them apart.
         split: Rows of ``batch`` in each part, all with at least two valid samples.
         inputs: What the features' ``inputs`` make of the whole ``batch``, where that is known already.
         fitted: Folder that keeps what feature extractors have learned on their own, for further trainings on the
@@ -155,7 +159,6 @@ def fit_predictor(
             _prepare(batch[rows], predictor, inputs[rows]) for rows in (split.train, split.validation)
         )
         progress = _Training(config, predictor, keeper, train, validation, fitted).run(report)
-        predictor.load_state_dict(keeper.model)
     return predictor.eval(), progress
 
 
@@ -216,7 +219,7 @@ def train_predictor(
                 show(row, done)
 
             _Training(config, predictor, folder, train, validation).run(report, tell)
-    folder.finish()
+    folder.close()
     return folder.path
 
 
@@ -232,6 +235,10 @@ class _Memory:
 
     def restore(self, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
         """There is never anything to go on from."""
+
+    def finish(self, predictor: EffectPredictor) -> None:
+        """Keep the finished predictor."""
+        self.model = predictor.state_dict()
 
 
 class _Training:
@@ -249,14 +256,10 @@ class _Training:
         self.config, self.predictor, self.keeper, self.fitted = config, predictor, keeper, fitted
         self.train, self.validation = train, validation
         self.epochs = config.num_epochs(len(train.batch))
-        valid = valid_samples(train.batch)
-        mean, scale = state_statistics(train.states, valid, predictor.state)
+        mean, scale = state_statistics(train.states, train.valid, predictor.state)
         predictor.set_normalisation(mean, scale, train.batch.times)
         predictor.set_known(train.known)
-        self.states = (
-            predictor.normalise(train.states) * torch.from_numpy(valid).to(predictor.device)[..., None]
-        )
-        self.lengths = torch.from_numpy(valid_lengths(train.batch)).to(predictor.device)
+        self.effects = self._effects_of(train)
         self.optimizer = make_optimizer(predictor)
 
     def run(
@@ -284,6 +287,14 @@ class _Training:
             done = done.with_epoch(row)
             self.keeper.save(done, self.predictor, self.optimizer)
             show(row, done)
+        self.predictor.load_state_dict(self.keeper.model)
+        if type(self.predictor).finish is not EffectPredictor.finish:
+            with torch.no_grad():
+                self.predictor.finish(
+                    *(self._features_of(self.train), self.effects),
+                    *(self._features_of(self.validation), self._effects_of(self.validation)),
+                )
+            self.keeper.finish(self.predictor)
         return done
 
     def _fit_features(self, report: Callable[[str], None]) -> None:
@@ -309,7 +320,18 @@ class _Training:
     def _prepare_predictor(self) -> None:
         if type(self.predictor).prepare is not EffectPredictor.prepare:
             with torch.no_grad():
-                self.predictor.prepare(self._features_of(self.train), self.states, self.lengths)
+                self.predictor.prepare(self._features_of(self.train), self.effects)
+
+    def _effects_of(self, part: _Part) -> Effects:
+        predictor = self.predictor
+        states = (
+            predictor.normalise(part.states) * torch.from_numpy(part.valid).to(predictor.device)[..., None]
+        )
+        lengths, outcomes = (
+            torch.from_numpy(numbers).to(predictor.device)
+            for numbers in (predictor.lengths(part.batch), predictor.number_outcomes(part.batch))
+        )
+        return Effects(states, lengths, outcomes)
 
     def _features_of(self, part: _Part) -> Tensor:
         return self.predictor.add_known(self.predictor.compute_features(part.inputs), part.known)
@@ -317,7 +339,7 @@ class _Training:
     def _epoch(self, epoch: int, fixed: Tensor | None) -> float:
         """One pass over the training part; the mean loss. ``fixed`` are features that do not change."""
         predictor, optimizer, device = self.predictor, self.optimizer, self.predictor.device
-        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.states))
+        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.effects))
         total = torch.zeros((), device=device)
         predictor.train()
         with seeded(self.config.seed, epoch, device):
@@ -332,7 +354,7 @@ class _Training:
                     features = predictor.add_known(features, self.train.known[rows.numpy()])
                 else:
                     features = fixed[rows]
-                loss = predictor.training_loss(features, self.states[rows], self.lengths[rows])
+                loss = predictor.training_loss(features, self.effects[rows])
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
@@ -349,9 +371,8 @@ class _Training:
         part, predictor = self.validation, self.predictor
         features = self._features_of(part) if fixed is None else fixed
         imagined = predictor.imagine_states(features, part.states[:, 0])
-        valid = valid_samples(part.batch)
-        off = (imagined - part.states)[valid] / predictor.state_scale.cpu().numpy()
-        truth = np.where(valid[..., None], part.batch.com, np.nan)
+        off = (imagined - part.states)[part.valid] / predictor.state_scale.cpu().numpy()
+        truth = np.where(part.valid[..., None], part.batch.com, np.nan)
         return {
             "validation_loss": predictor.validation_loss(off),
             "validation_full_cm": 100 * float(np.mean(mean_distance(imagined[..., :3], truth))),
@@ -378,7 +399,8 @@ def _hash_split(split: Split) -> str:
 def _prepare(batch: InteractionBatch, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
     inputs = predictor.features.inputs(batch) if inputs is None else inputs
     known = observed_values(batch, predictor.known)
-    return _Part(batch, inputs, known, encode_states(batch, predictor.state))
+    valid = valid_samples(batch, predictor.lengths(batch))
+    return _Part(batch, inputs, known, predictor.encode(batch), valid)
 
 
 @contextmanager

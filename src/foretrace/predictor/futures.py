@@ -1,0 +1,208 @@
+"""What may happen: several futures, each with its probability and how far the motion may be from it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+LEVELS = np.arange(1, 100) / 100
+"""Probabilities of the regions whose widths a predictor keeps."""
+MIN_PROBABILITY = 0.05
+"""A future less probable than this belongs to no region, unless it is the most probable one."""
+FLOOR = 1e-4
+"""Nobody is surer of a position than this [m]: what half the time step changes in simulation is a fifth of it."""
+NOISE = 5e-4
+"""What an observed position may be off [m]; also what principal motions leave out."""
+COORDINATES = 6
+"""A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
+TURN_LENGTH = 0.05
+"""A turn by 1 rad weighs as much as a displacement by this [m]: about the distance from hinge to centre of mass."""
+
+
+@dataclass(frozen=True)
+class Futures:
+    """What may happen in interactions: whole motions that exclude each other."""
+
+    probability: Float[np.ndarray, "batch futures"]
+    """Of each; they sum up to 1."""
+    outcome: tuple[str, ...]
+    """What becomes of the object in each."""
+    com: Float[np.ndarray, "batch futures time 3"]
+    """Centres of mass in the action frame [m]."""
+    pose: Float[np.ndarray, "batch futures time 7"]
+    """As ``ImaginedEffect.pose_trajectory``."""
+    spread: Float[np.ndarray, "batch futures time"]
+    """Expected distance of the centre of mass from it (root mean square) [m]."""
+    support_points: Float[np.ndarray, "batch futures 2 2"]
+    """Ends of the edge that the object turns about, in the action frame at rest [m]."""
+    quantiles: Float[np.ndarray, " levels"]
+    """How many spreads away from the nearest future whole motions stayed in the validation part, by `LEVELS`."""
+
+    def __len__(self) -> int:
+        return len(self.probability)
+
+    def __getitem__(self, rows: slice | np.ndarray) -> "Futures":
+        names = ("probability", "com", "pose", "spread", "support_points")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    @property
+    def counted(self) -> np.ndarray:
+        """(batch, futures) bool: which futures are probable enough to belong to regions."""
+        best = self.probability.max(axis=1, keepdims=True)
+        return self.probability >= np.minimum(best, MIN_PROBABILITY)
+
+    def radius(self, level: float) -> Float[np.ndarray, "batch futures time"]:
+        """Radii of tubes [m] about those futures that count: whole motions stay in one of them with that probability.
+
+        NaN for a future that does not count; infinite where the validation part was too small to tell.
+
+        Raises:
+            ValueError: The level is not between 0.01 and 0.99.
+        """
+        if not LEVELS[0] <= level <= LEVELS[-1]:
+            raise ValueError(f"level {level} of a region: choose one from {LEVELS[0]} to {LEVELS[-1]}")
+        wide = float(np.interp(level, LEVELS, self.quantiles))
+        return np.where(self.counted[..., None], wide * (self.spread + FLOOR), np.nan)
+
+    def outcomes(self) -> dict[str, Float[np.ndarray, " batch"]]:
+        """Probability of each outcome."""
+        names = dict.fromkeys(self.outcome)
+        mine = np.array(self.outcome)
+        return {name: self.probability[:, mine == name].sum(axis=1) for name in names}
+
+
+def conformal_scores(
+    futures: Futures, com: Float[np.ndarray, "batch time 3"], lengths: np.ndarray
+) -> Float[np.ndarray, " batch"]:
+    """How many spreads motions were away, where they were furthest, from the future that they followed best.
+
+    A region of all motions with at most some score is a union of tubes about futures.
+
+    Args:
+        futures: What was expected.
+        com: What happened [m].
+        lengths: Samples of each that count.
+    """
+    apart = np.linalg.norm(futures.com - com[:, None], axis=-1) / (futures.spread + FLOOR)
+    valid = np.arange(com.shape[1]) < lengths[:, None]
+    furthest = np.where(valid[:, None], apart, 0.0).max(axis=2)
+    return np.where(futures.counted, furthest, np.inf).min(axis=1)
+
+
+def quantiles_of(scores: Float[np.ndarray, " n"]) -> Float[np.ndarray, " levels"]:
+    """Scores that further ones exceed with probabilities of 1 less `LEVELS` at most (split-conformal prediction).
+
+    Vovk et al., 2005, "Algorithmic learning in a random world": exact for scores that could come in any order.
+    """
+    known = np.append(np.sort(scores), np.inf)
+    return known[np.minimum(np.ceil(LEVELS * len(known)).astype(int) - 1, len(scores))]
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Gaussian distributions of the weights of principal motions, one for each hinge and outcome."""
+
+    com: Float[Tensor, "batch 3"]
+    """Centres of mass at rest in the action frame [m]."""
+    axes: Float[Tensor, "batch hinges 3 3"]
+    """Rows: the hinges' axes in the action frame."""
+    ends: Float[Tensor, "batch hinges 2 2"]
+    """Ends of the hinges [m]."""
+    odds: Float[Tensor, "batch hinges outcomes"]
+    """Logarithms of probabilities."""
+    mean: Float[Tensor, "batch hinges outcomes motions"]
+    """Expected weights."""
+    factor: Float[Tensor, "batch hinges outcomes motions motions"]
+    """Cholesky factors of their covariances."""
+    motions: Float[Tensor, "motions time 6"]
+    """Principal motions along a hinge's axes [m]; turns times ``TURN_LENGTH``."""
+    mean_motion: Float[Tensor, "time 6"]
+    """What they are added to."""
+    observed: Float[Tensor, "batch samples 6"]
+    """Positions [m] and rotation vectors [rad] that were observed."""
+
+    def given(self, observed: Float[Tensor, "batch samples 6"]) -> "Mixture":
+        """The mixture after the first samples were observed, by Bayes' rule.
+
+        Args:
+            observed: Positions in the action frame [m] and rotation vectors since rest [rad].
+        """
+        k = observed.shape[1]
+        motion = torch.cat([observed[..., :3] - self.com[:, None], TURN_LENGTH * observed[..., 3:]], dim=-1)
+        seen = along_hinges(self.axes, motion)  # (batch, hinges, samples, 6)
+        basis = self.motions[:, :k].flatten(1)
+        off = (seen - self.mean_motion[:k]).flatten(2)[:, :, None] - self.mean @ basis
+        # Of standard-normal weights z, of which the motion is a linear image.
+        image = self.factor.mT @ basis / NOISE
+        off = off[..., None] / NOISE
+        precision = image @ image.mT + torch.eye(image.shape[-2], dtype=image.dtype, device=image.device)
+        root = torch.linalg.cholesky(precision)
+        pull = image @ off
+        z = torch.cholesky_solve(pull, root)
+        evidence = (pull * z).sum(dim=(-2, -1)) - off.square().sum(dim=(-2, -1))
+        evidence = evidence / 2 - root.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        odds = (self.odds + evidence).flatten(1).log_softmax(dim=1).view_as(self.odds)
+        mean = self.mean + (self.factor @ z)[..., 0]
+        inverse = torch.linalg.solve_triangular(
+            root, torch.eye(len(basis)).to(root).expand_as(root), upper=False
+        )
+        # (factor inverse^T) (factor inverse^T)^T is the covariance; any square root of it will do.
+        return replace(self, odds=odds, mean=mean, factor=self.factor @ inverse.mT, observed=observed)
+
+    def most_probable(self) -> Float[Tensor, "batch time 6"]:
+        """Positions [m] and rotation vectors [rad] of the most probable future of each."""
+        rows = torch.arange(len(self.com), device=self.com.device)
+        best = self.odds.flatten(1).argmax(dim=1)
+        hinge = best // self.odds.shape[2]
+        return self._states(self.mean.flatten(1, 2)[rows, best][:, None], self.axes[rows, hinge][:, None])[
+            :, 0
+        ]
+
+    def states(self) -> Float[Tensor, "batch futures time 6"]:
+        """Positions [m] and rotation vectors [rad] of all futures."""
+        axes = self.axes[:, :, None].expand(*self.odds.shape, 3, 3)
+        return self._states(self.mean.flatten(1, 2), axes.flatten(1, 2))
+
+    def sample(self, num: int, generator: torch.Generator | None = None) -> Float[Tensor, "batch num time 6"]:
+        """Positions [m] and rotation vectors [rad] drawn at random."""
+        rows = torch.arange(len(self.com), device=self.com.device)[:, None]
+        chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
+        z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator)
+        factor = self.factor.flatten(1, 2)[rows, chosen]
+        weights = self.mean.flatten(1, 2)[rows, chosen] + (factor @ z[..., None].to(factor))[..., 0]
+        return self._states(weights, self.axes[rows, chosen // self.odds.shape[2]])
+
+    def spread(self) -> Float[Tensor, "batch futures time"]:
+        """Root mean square of the distance from each future's positions [m]."""
+        displaced = self.motions[..., :3]
+        images = torch.einsum("bfij,itc->bfjtc", self.factor.flatten(1, 2), displaced)
+        return images.square().sum(dim=(2, 4)).sqrt()
+
+    def _states(self, weights: Tensor, axes: Float[Tensor, "batch futures 3 3"]) -> Tensor:
+        motion = (weights @ self.motions.flatten(1)).unflatten(-1, self.mean_motion.shape) + self.mean_motion
+        moved, turned = (part @ axes for part in motion.split(3, dim=-1))
+        states = torch.cat([self.com[:, None, None] + moved, turned / TURN_LENGTH], dim=-1)
+        k = self.observed.shape[1]
+        seen = self.observed[:, None].expand(-1, states.shape[1], -1, -1)
+        return torch.cat([seen, states[:, :, k:]], dim=2)
+
+
+def along_hinges(
+    axes: Float[Tensor, "batch *hinges 3 3"], motion: Float[Tensor, "batch time 6"]
+) -> Float[Tensor, "batch *hinges time 6"]:
+    """Displacements and turns in the action frame along hinges' axes.
+
+    A turn seen along left-handed axes, those of a mirror image, goes the other way round.
+    """
+    extra = (1,) * (axes.dim() - 3)
+    moved, turned = (
+        part.view(len(part), *extra, *part.shape[1:]) @ axes.mT for part in motion.split(3, dim=-1)
+    )
+    return torch.cat([moved, torch.linalg.det(axes)[..., None, None] * turned], dim=-1)
+
+
+def no_observations(com: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 0 6"]:
+    """What was observed when nothing was."""
+    return com.new_zeros(len(com), 0, COORDINATES)
