@@ -15,6 +15,7 @@ import tyro
 
 import foretrace
 from foretrace.cli.calibrate import calibrate
+from foretrace.cli.capture import capture
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
@@ -70,6 +71,7 @@ COMMANDS: dict[str, Command | Group] = {
     "describe": describe,
     "doctor": doctor,
     "calibrate": calibrate,
+    "capture": capture,
     "import": import_recording,
     "robot": robot,
 }

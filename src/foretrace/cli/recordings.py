@@ -41,9 +41,10 @@ def import_recording(
     usual values stand in the data set. The tool's path is the planned one.
 
     Args:
-        recording: Folder of frames with timestamps.csv, video file, or bag of ROS 1 or ROS 2.
+        recording: Folder of frames with timestamps.csv, video file, bag of ROS 1 or ROS 2, or RealSense recording.
         out: Folder of the data set.
-        camera: The camera's JSON file; by default camera.json beside the recording, or a bag's camera_info.
+        camera: The camera's JSON file; by default camera.json beside the recording, or what a bag or a RealSense
+            recording says.
         markers: Marker layout; by default markers.json beside the recording.
         object: The object's shape: a .json file from `to_dict`, an .stl or .obj mesh, or a text file with the outline's
             corners. Without it, the prism that its outline in the first frame shows.

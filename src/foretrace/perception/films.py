@@ -13,6 +13,7 @@ from foretrace.errors import PerceptionError
 from foretrace.interactions import film_folder
 from foretrace.interactions.film_folder import FilmNotes, Frame
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception import realsense
 from foretrace.perception.calibration import read_picture
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
@@ -47,7 +48,8 @@ def open_film(path: str | Path, topic: str | None = None, depth_topic: str | Non
     """A film of any of the kinds that are read.
 
     Args:
-        path: A folder with ``timestamps.csv``, a video file, or a bag of ROS 1 or ROS 2.
+        path: A folder with ``timestamps.csv``, a video file, a bag of ROS 1 or ROS 2, or a RealSense
+            recording.
         topic: Image topic of a bag; needed if it has several.
         depth_topic: Topic of a bag's depth images; by default the one that is aligned with the images, if any.
 
@@ -57,6 +59,9 @@ def open_film(path: str | Path, topic: str | None = None, depth_topic: str | Non
     path = Path(path)
     if not path.exists():
         raise PerceptionError(f"no recording at {path}: check the path")
+    if path.suffix.lower() in BAGS and path.is_file() and realsense.is_recording(path):
+        frames, camera = realsense.open_recording(path)
+        return Film(path, frames, camera=camera)
     if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
         from foretrace.perception.bags import open_bag
 

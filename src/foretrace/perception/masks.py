@@ -1,6 +1,7 @@
 """Where the object is in a picture: by what changed, brightness, colour or GrabCut; by height in a depth picture."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,9 +68,8 @@ def _coverage(
     """
     size = 2 * EDGE_DEPTH + 1
     inside = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8))
-    away, nearest = cv2.distanceTransformWithLabels(
-        1 - inside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    away, labels = cv2.distanceTransformWithLabels(1 - inside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    nearest: Any = labels
     rows, columns = np.nonzero(mask & (inside == 0) & (away <= 2 * size))
     colours = np.zeros((int(nearest.max()) + 1, 3), dtype=now.dtype)
     colours[nearest[inside > 0]] = now[inside > 0]

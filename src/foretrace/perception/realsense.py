@@ -1,0 +1,267 @@
+"""RealSense cameras and their recordings, through the maker's library (``pip install foretrace[realsense]``).
+
+Depth is aligned with the colour pictures by that library, which knows where the two sensors sit. It was tried on
+recordings of a virtual camera only.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foretrace.errors import PerceptionError
+from foretrace.interactions.film_folder import Frame
+from foretrace.interactions.pinhole import PinholeCamera
+
+TOGETHER = 0.02
+"""Depth belongs to a colour picture taken at most so much earlier or later [s]."""
+LOOK = 1 << 22
+"""Bytes at either end of a bag in which the names of its topics are looked for."""
+SILENCE = 5000
+"""So long a camera or a recording may give no picture [ms]."""
+GLANCE = 200
+"""So long a recording is waited for before it is asked whether it has ended [ms]."""
+WARM_UP = 30
+"""Frames after the start that are thrown away: a camera needs them to find its exposure."""
+
+
+@dataclass(frozen=True)
+class CaptureConfig:
+    """How a camera films.
+
+    Raises:
+        PerceptionError: A value is not positive.
+    """
+
+    width: int = 1280
+    """Columns of the pictures."""
+    height: int = 720
+    """Rows of the pictures."""
+    frames_per_second: int = 30
+    """Frames per second."""
+    depth_every: int = 10
+    """Depth is kept with every so many colour pictures; 0: never."""
+    serial: str | None = None
+    """Serial number of the camera; None: the only one."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("width", 1), ("height", 1), ("frames_per_second", 1), ("depth_every", 0)):
+            if getattr(self, name) < least:
+                raise PerceptionError(f"capture: {name} = {getattr(self, name)}, it must be at least {least}")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file was recorded by a RealSense camera: its topics begin with the device."""
+    with open(path, "rb") as file:
+        ends = file.read(LOOK)
+        file.seek(max(0, path.stat().st_size - LOOK))
+        ends += file.read(LOOK)
+    return b"/device_0/" in ends
+
+
+def open_recording(path: Path) -> tuple[Callable[[], Iterator[Frame]], PinholeCamera | None]:
+    """Frames of a RealSense recording, and its colour camera as the maker calibrated it.
+
+    Args:
+        path: The recording: ``.db3``, or ``.bag`` from before 2026.
+
+    Raises:
+        PerceptionError: The recording is damaged or has no colour, or the library is not installed.
+    """
+    with _Playing(path) as playing:
+        camera = playing.camera
+    return lambda: _recorded(path), camera
+
+
+def _recorded(path: Path) -> Iterator[Frame]:
+    with _Playing(path) as playing:
+        yield from playing.frames()
+
+
+def _library() -> Any:
+    try:
+        import pyrealsense2
+    except ImportError as error:
+        raise PerceptionError(
+            f"RealSense cameras and their recordings need pyrealsense2 ({error}): `pip install foretrace[realsense]`"
+        ) from error
+    return pyrealsense2
+
+
+class _Playing:
+    """A recording being played, as fast as it is read."""
+
+    def __init__(self, path: Path):
+        self._path, self._rs = path, _library()
+        self._pipeline = self._rs.pipeline()
+
+    def __enter__(self) -> "_Playing":
+        config = self._rs.config()
+        try:
+            config.enable_device_from_file(str(self._path), repeat_playback=False)
+            # Before it starts: its first frames would be lost.
+            found = config.resolve(self._rs.pipeline_wrapper(self._pipeline))
+            found.get_device().as_playback().set_real_time(False)
+            self._profile = self._pipeline.start(config)
+        except RuntimeError as error:
+            raise PerceptionError(
+                f"RealSense recording {self._path} cannot be read ({error}): it is cut off; record or copy it again"
+            ) from error
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._pipeline.stop()
+
+    @property
+    def camera(self) -> PinholeCamera | None:
+        """The colour camera."""
+        return _camera(self._rs, self._profile, str(self._path))
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames, to the recording's end."""
+        align = self._rs.align(self._rs.stream.color)
+        return (_frame(frames, align) for frames in _once_each(self._framesets()))
+
+    def _framesets(self) -> Iterator[Any]:
+        recorded, silence = self._profile.get_device().as_playback(), 0
+        while silence < SILENCE:
+            there, frames = self._pipeline.try_wait_for_frames(GLANCE)
+            if there:
+                silence = 0
+                yield frames
+            elif recorded.current_status() == self._rs.playback_status.stopped:
+                return
+            silence += 0 if there else GLANCE
+        raise PerceptionError(
+            f"RealSense recording {self._path} gives no more pictures before its end: record or copy it again"
+        )
+
+
+def _once_each(framesets: Iterator[Any]) -> Iterator[Any]:
+    """One set for each colour picture: the library repeats one picture beside the next of the other kind."""
+    held: Any = None
+    for frames in framesets:
+        colour = frames.get_color_frame()
+        if not colour:
+            continue
+        if held is not None and held.get_color_frame().get_frame_number() == colour.get_frame_number():
+            held = min(held, frames, key=_apart)
+            continue
+        if held is not None:
+            yield held
+        held = frames
+    if held is not None:
+        yield held
+
+
+def _apart(frames: Any) -> float:
+    """Time between a set's colour and depth [s]."""
+    depth = frames.get_depth_frame()
+    return abs(depth.get_timestamp() - frames.get_color_frame().get_timestamp()) / 1000 if depth else np.inf
+
+
+def _frame(frames: Any, align: Any) -> Frame:
+    """A set as a frame; its depth as the colour camera would see it, unless there is nothing to align it with."""
+    metres = None
+    if align is not None and _apart(frames) <= TOGETHER:
+        frames = align.process(frames)
+        depth = frames.get_depth_frame()
+        metres = np.array(depth.get_data()).astype(float) * depth.get_units()
+    colour = frames.get_color_frame()
+    picture, kind = np.array(colour.get_data()), colour.get_profile().format().name
+    if kind not in ("rgb8", "bgr8"):
+        raise PerceptionError(f"RealSense recording has colour as {kind}: record it as rgb8 or bgr8")
+    ordered = picture if kind == "bgr8" else np.ascontiguousarray(picture[..., ::-1])
+    return Frame(colour.get_timestamp() / 1000, ordered, metres)
+
+
+def _camera(rs: Any, profile: Any, name: str) -> PinholeCamera | None:
+    """The colour camera as its maker calibrated it; None where its lens is described in another way than OpenCV's."""
+    colours = [one for one in profile.get_streams() if one.stream_type() == rs.stream.color]
+    if not colours:
+        raise PerceptionError(f"{name} has no colour stream: film with colour and depth")
+    found = colours[0].as_video_stream_profile().get_intrinsics()
+    bent = any(found.coeffs)
+    if bent and found.model != rs.distortion.brown_conrady:
+        return None
+    lens = tuple(float(value) for value in found.coeffs) if bent else ()
+    return PinholeCamera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy, lens)
+
+
+class LiveCamera:
+    """A RealSense camera that films within a ``with`` block.
+
+    Args:
+        config: How it films.
+
+    Raises:
+        PerceptionError: There is no such camera, it cannot film so, or the library is not installed.
+    """
+
+    def __init__(self, config: CaptureConfig = CaptureConfig()):
+        self._config, self._rs = config, _library()
+        self.lost = 0
+        """Frames that came too fast to be kept."""
+
+    def __enter__(self) -> "LiveCamera":
+        rs, config = self._rs, self._rs.config()
+        if not len(rs.context().query_devices()):  # the pipeline would look for a quarter of a minute
+            raise PerceptionError(
+                "no RealSense camera is connected: plug it into a USB 3 port; on Linux, librealsense's udev rules let "
+                "you use it"
+            )
+        size = (self._config.width, self._config.height)
+        if self._config.serial is not None:
+            config.enable_device(self._config.serial)
+        config.enable_stream(rs.stream.color, *size, rs.format.bgr8, self._config.frames_per_second)
+        if self._config.depth_every:
+            config.enable_stream(rs.stream.depth, rs.format.z16, self._config.frames_per_second)
+        self._pipeline = rs.pipeline()
+        try:
+            profile = self._pipeline.start(config)
+        except RuntimeError as error:
+            which = "" if self._config.serial is None else f" {self._config.serial}"
+            raise PerceptionError(
+                f"no RealSense camera{which} films {size[0]} x {size[1]} pixels {self._config.frames_per_second} times "
+                f"a second ({error}): close other programs that use it, check its serial number and the USB 3 port, or "
+                "choose another size"
+            ) from error
+        self.camera = _camera(rs, profile, "the RealSense camera")
+        """Its colour camera, as its maker calibrated it; None where its lens is described otherwise."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._pipeline.stop()
+
+    def frames(self, until: Callable[[float], bool]) -> Iterator[Frame]:
+        """Frames as they come.
+
+        Args:
+            until: Asked with the time since the first frame [s]; says when to stop.
+
+        Raises:
+            PerceptionError: The camera falls silent.
+        """
+        align, first, last = self._rs.align(self._rs.stream.color), None, None
+        for number, frames in enumerate(_once_each(iter(self._next, None)), -WARM_UP):
+            if number < 0:
+                continue
+            with_depth = self._config.depth_every and number % self._config.depth_every == 0
+            frame = _frame(frames, align if with_depth else None)
+            first = frame.time if first is None else first
+            if until(frame.time - first):
+                return
+            shown = frames.get_color_frame().get_frame_number()
+            self.lost += 0 if last is None else shown - last - 1
+            last = shown
+            yield frame
+
+    def _next(self) -> Any:
+        try:
+            return self._pipeline.wait_for_frames(SILENCE)
+        except RuntimeError as error:
+            raise PerceptionError(
+                f"the RealSense camera gives no pictures ({error}): plug it in again"
+            ) from error
