@@ -27,11 +27,16 @@ from foretrace.evaluation.results import Metrics, ResultsTable, Trial, read_resu
 from foretrace.evaluation.runner import run_trials
 from foretrace.features import FEATURES
 from foretrace.interactions.record import Outcome
-from foretrace.predictor import TrainConfig
+from foretrace.predictor import RECIPES, TrainConfig
 from foretrace.predictor.training import fit_predictor
 from foretrace.simulation.collect import CollectConfig, collect, trial
 
-RECIPE = Recipe(TrainConfig(hidden=8, epochs=1, min_steps=1), factories.QUICK_OPTIONS, proportional=True)
+RECIPE = Recipe(
+    TrainConfig(hidden=8, epochs=1, min_steps=1),
+    factories.QUICK_OPTIONS,
+    proportional=True,
+    one_shot=replace(RECIPES["one-shot"], hidden=8, epochs=1, min_steps=1),
+)
 QUIET = Console(quiet=True)
 FEW = ("none", "im-cnn", "sc-800", "ae-256", "sp-pred")
 TRIALS = [
@@ -39,9 +44,11 @@ TRIALS = [
     *plan(["features", "half-plane"], seeds=[0]),
     *plan(["training-size", "steps-ahead", "novel-corners"], FEW, seeds=[0]),
     *plan(["support-points-plain"], ["sp-rule"], seeds=[0]),
+    *plan(["ablation"], ["one hinge", "no mirror"], seeds=[0]),
 ]
 """Something of every experiment."""
 ERRORS = {"full", "final", "full_median", "final_median", "best_epoch", "epochs", "seconds"}
+OF_POSES = ("one-shot", "one hinge", "no mirror")
 
 
 def fake_simulate(config: CollectConfig, id: int):
@@ -94,11 +101,12 @@ def test_every_experiment_gives_every_number_once(data, results):
     assert np.isfinite(results["value"]).all()
     groups = results.groupby(["experiment", "features", "seed", "setting"])["metric"].agg(set)
     assert set(groups.index) == {(t.experiment, t.features, t.seed, t.setting) for t in TRIALS}
-    for (experiment, *_), metrics in groups.items():
+    for (experiment, name, *_), metrics in groups.items():
         if experiment.startswith("support-points"):
             assert {"accuracy", "accuracy_from_mask", "seconds"} < metrics
         else:
-            assert metrics == ERRORS
+            of_poses = {"rotation", "rotation_median", "add", "add_median"}
+            assert metrics == (ERRORS | of_poses if name in OF_POSES else ERRORS)
     assert count_missing(data, data.parent / "results", TRIALS, RECIPE) == dict.fromkeys(EXPERIMENTS, 0)
 
 
@@ -196,12 +204,12 @@ def test_the_plan_is_the_papers():
         "support-points": 18,
         "support-points-novel": 12,
         "support-points-plain": 2,
-        "features": 22,
+        "features": 24,
         "half-plane": 3,
     }
-    per_seed |= {"training-size": 66, "steps-ahead": 44, "novel-corners": 44}
+    per_seed |= {"training-size": 72, "steps-ahead": 44, "novel-corners": 48, "ablation": 4}
     assert Counter(t.experiment for t in trials) == {name: 10 * count for name, count in per_seed.items()}
-    assert {t.features for t in trials if t.experiment == "features"} == set(FEATURES) - {"outline"}
+    assert {t.features for t in trials if t.experiment == "features"} == set(FEATURES) - {"outline"} | {"one-shot"}
     for name in EXPERIMENTS:
         seeds = [t.seed for t in trials if t.experiment == name]
         assert seeds == sorted(seeds)
@@ -252,6 +260,9 @@ def test_options_and_steps_reach_the_training():
     assert RECIPE.configure(Trial("steps-ahead", "ae-256", 0, "4")).steps_ahead == 4
     assert RECIPE.configure(Trial("training-size", "ae-256", 0, "4")).steps_ahead == 1
     assert RECIPE.configure(Trial("features", "ae-256", 0, "shuffled")).feature_options["width"] == 8
+    whole = RECIPE.configure(Trial("features", "one-shot", 3, "shuffled"))
+    assert (whole.predictor, whole.features, whole.hidden, whole.seed) == ("one-shot", "outline", 8, 3)
+    assert RECIPE.configure(Trial("ablation", "one hinge", 0, "shuffled")).predictor_options == {"hinges": 1}
 
 
 def test_small_data_needs_proportions(data, tmp_path):

@@ -80,7 +80,8 @@ def evaluate_paper(
     trials = protocol.plan(experiments or None, features or None, settings or None, seeds)
     recipe = protocol.Recipe(proportional=proportional)
     if epochs is not None:
-        recipe = replace(recipe, training=replace(recipe.training, epochs=epochs))
+        training, one_shot = (replace(config, epochs=epochs) for config in (recipe.training, recipe.one_shot))
+        recipe = replace(recipe, training=training, one_shot=one_shot)
     if dry_run:
         for name, count in protocol.count_missing(data, out, trials, recipe).items():
             print(f"{name:20s} {count:5d} trainings missing")

@@ -28,6 +28,7 @@ class Look(NamedTuple):
 
 
 BLUE, ORANGE, VERMILLION, GREEN, PURPLE = "#0072b2", "#e69f00", "#d55e00", "#009e73", "#cc79a7"
+SKY = "#3d9ad1"
 DOTTED, DASHED, SOLID = (0, (1, 1.4)), (0, (4, 1.6)), "-"
 LOOKS = {
     "none": Look(INK, "x", SOLID),
@@ -41,6 +42,7 @@ LOOKS = {
     "sp-pred": Look(GREEN, "D", DASHED),
     "sp-truth": Look(GREEN, "*", SOLID),
     "sp-rule": Look(PURPLE, "h", DOTTED),
+    "one-shot": Look(SKY, "p", SOLID),
     "chance": Look(GREY, "_", DOTTED),
 }
 """Every predictor in the order of the paper's figures, then what the paper does not have."""
@@ -49,6 +51,7 @@ FAMILIES = {
     "unsupervised": UNSUPERVISED,
     "supervised": SUPERVISED,
     "task-specific": (*TASK_SPECIFIC, "sp-rule"),
+    "whole motions": ("one-shot",),
 }
 GRID = "#e6e8ec"
 QUIET = "#5b6472"

@@ -3,12 +3,14 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import EffectPredictor
 from foretrace.predictor.base import Start
 from foretrace.predictor.states import valid_samples
-from foretrace.trajectories import final_distance, mean_distance
+from foretrace.trajectories import final_distance, mean_distance, rotation_error
 
 STARTS: tuple[Start, ...] = ("observed", "estimated")
 METRICS = {"full": mean_distance, "final": final_distance}
@@ -39,6 +41,43 @@ def evaluate_predictor(predictor: EffectPredictor, batch: InteractionBatch) -> l
                 row = {"group": group, "value": value, "metric": metric, "start": start}
                 rows.append(row | _summary(errors[chosen]))
     return rows
+
+
+def pose_errors(
+    imagined: Float[np.ndarray, "batch time 7"],
+    batch: InteractionBatch,
+    valid: Bool[np.ndarray, "batch time"],
+) -> dict[str, Float[np.ndarray, " batch"]]:
+    """How far imagined poses are from observed ones, averaged over time.
+
+    Args:
+        imagined: As ``ImaginedBatch.pose``.
+        batch: What happened.
+        valid: The samples to judge by.
+
+    Returns:
+        ``rotation``: geodesic angle [degrees]. ``add``: mean distance of the object's lower and upper corners [cm]
+        (Hinterstoisser et al., 2012).
+    """
+    observed = np.where(valid[..., None], batch.pose[..., 3:], batch.pose[:, :1, 3:])
+    rotations = quaternion_to_matrix(observed)
+    since_rest = rotations @ np.swapaxes(rotations[:, :1], -1, -2)
+    told = quaternion_to_matrix(imagined[..., 3:])
+    count = valid.sum(axis=1)
+    angle = np.degrees(rotation_error(imagined[..., 3:], matrix_to_quaternion(since_rest)))
+    height = batch.height.max(axis=(1, 2))
+    apart = []
+    for top in (0.0, 1.0):
+        level = np.broadcast_to((top * height)[:, None, None], (*batch.corners.shape[:2], 1))
+        points = np.concatenate([batch.corners, level], axis=2) - batch.com[:, :1]  # (batch, corners, 3)
+        there = batch.com[:, :, None] + np.einsum("btij,bcj->btci", since_rest, points)
+        here = imagined[:, :, None, :3] + np.einsum("btij,bcj->btci", told, points)
+        apart.append(np.linalg.norm(here - there, axis=-1))
+    distance = np.nanmean(np.concatenate(apart, axis=2), axis=2, where=valid[..., None])
+    return {
+        "rotation": np.where(valid, angle, 0.0).sum(axis=1) / count,
+        "add": 100 * np.where(valid, distance, 0.0).sum(axis=1) / count,
+    }
 
 
 def _groups(batch: InteractionBatch) -> list[tuple[str, str, np.ndarray]]:

@@ -42,7 +42,7 @@ PANELS = {
     "Shape context": SHAPE_CONTEXTS,
     "Autoencoder": AUTOENCODERS,
     "Supervised": SUPERVISED,
-    "Support points": (*TASK_SPECIFIC, "sp-rule"),
+    "Support points": (*TASK_SPECIFIC, "sp-rule", "one-shot"),
 }
 """Predictors that share a panel where there is one for each family."""
 ERRORS = {"full": "error, full trajectory [cm]", "final": "error, final position [cm]"}

@@ -17,7 +17,7 @@ from rich.console import Console
 from torch import Tensor
 
 from foretrace.errors import ResultsError
-from foretrace.evaluation.experiments import METRICS
+from foretrace.evaluation.experiments import METRICS, pose_errors
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_machine, finished_trials
 from foretrace.evaluation.runner import Failure, run_trials
 from foretrace.evaluation.support import support_point_metrics
@@ -33,11 +33,11 @@ from foretrace.interactions.splits import (
     split_by_object,
     split_by_seed,
 )
-from foretrace.predictor import EffectPredictor, TrainConfig
+from foretrace.predictor import RECIPES, EffectPredictor, OneShotPredictor, TrainConfig
 from foretrace.predictor.checkpoint import settings_of
 from foretrace.predictor.known import observed_values
 from foretrace.predictor.run_folder import fingerprint
-from foretrace.predictor.states import rest_states, valid_lengths, valid_samples
+from foretrace.predictor.states import valid_lengths, valid_samples
 from foretrace.predictor.surroundings import find_device, thread_count
 from foretrace.predictor.training import fit_predictor
 
@@ -110,6 +110,15 @@ _PLAIN_SUPPORT: dict[str, dict[str, Option]] = {
     "sp-rule": {"setback": 0.0, "half_width": 0.0},
 }
 _ALL = tuple(label for label in FEATURES if label != Outline.label)
+ONE_SHOT = OneShotPredictor.label
+"""Compared as if it was another feature: the predictor of whole motions, which reads outlines."""
+_ABLATIONS: dict[str, dict[str, Option]] = {
+    "one hinge": {"hinges": 1},
+    "one network": {"members": 1},
+    "no mirror": {"mirrored": False},
+    "8 motions": {"motions": 8},
+}
+"""What the predictor of whole motions is without one of its parts, by its options."""
 
 EXPERIMENTS: dict[str, Experiment] = {
     "support-points": Experiment(
@@ -119,19 +128,22 @@ EXPERIMENTS: dict[str, Experiment] = {
     "support-points-plain": Experiment(
         tuple(_PLAIN_SUPPORT), ("100",), _share_of_training, _PLAIN_SUPPORT, names_corners=True
     ),
-    "features": Experiment(_ALL, ("shuffled", "by-object"), _shuffled_or_by_object),
+    "features": Experiment((*_ALL, ONE_SHOT), ("shuffled", "by-object"), _shuffled_or_by_object),
     "half-plane": Experiment(
         _SHAPE_CONTEXTS, ("shuffled",), _shuffled, {name: {"half_plane": True} for name in _SHAPE_CONTEXTS}
     ),
-    "training-size": Experiment(_ALL, ("2", "4", "8", "16", "32", "64"), _share_of_all),
+    "training-size": Experiment((*_ALL, ONE_SHOT), ("2", "4", "8", "16", "32", "64"), _share_of_all),
     "steps-ahead": Experiment(_ALL, ("2", "3", "4", "5"), _shuffled, varies_steps=True),
-    "novel-corners": Experiment(_ALL, _CORNERS, _novel_corners),
+    "novel-corners": Experiment((*_ALL, ONE_SHOT), _CORNERS, _novel_corners),
+    "ablation": Experiment(tuple(_ABLATIONS), ("shuffled",), _shuffled),
 }
 """The paper's comparisons by name: figures 9a, 9b, 10, 11, 12 and 13.
 
 Two ask what our choices change: in ``support-points-plain`` the network sees corners in the action frame and says
 points as they are, and the rule lifts at the contact point; ``half-plane`` counts only what of an outline lies ahead of
 the levered edge.
+
+``ablation`` takes parts away from the predictor of whole motions.
 
 One state ahead, the first setting of figure 12, is ``features`` ``shuffled``.
 """
@@ -212,14 +224,20 @@ class Recipe:
     """Settings of features, by label."""
     proportional: bool = False
     """Whether splits have the paper's proportions instead of its sizes."""
+    one_shot: TrainConfig = RECIPES[ONE_SHOT]
+    """Settings of the trainings of whole motions; seed and surroundings are replaced likewise."""
 
     def describe(self) -> dict[str, Any]:
         """As one level of JSON-able settings."""
         replaced = {"features", "feature_options", "steps_ahead", "outcomes", "split", "seed"}
         replaced |= {"device", "precision", "threads"}
-        settings = {name: value for name, value in settings_of(self.training).items() if name not in replaced}
+        settings, one_shot = (
+            {name: value for name, value in settings_of(config).items() if name not in replaced}
+            for config in (self.training, self.one_shot)
+        )
         options = {label: dict(chosen) for label, chosen in self.feature_options.items()}
-        return settings | {"feature_options": options, "proportional": self.proportional}
+        more = {"feature_options": options, "proportional": self.proportional, "one_shot": one_shot}
+        return settings | more
 
     def options(self, trial: Trial) -> dict[str, Option]:
         """Settings of one trial's features."""
@@ -229,6 +247,12 @@ class Recipe:
     def configure(self, trial: Trial) -> TrainConfig:
         """Settings of one trial's training."""
         experiment = EXPERIMENTS[trial.experiment]
+        if trial.features == ONE_SHOT or trial.features in _ABLATIONS:
+            surroundings = {name: getattr(self.training, name) for name in ("device", "threads", "precision")}
+            options = _ABLATIONS.get(trial.features, {})
+            return replace(
+                self.one_shot, predictor_options=options, seed=trial.seed, split=None, **surroundings
+            )
         options = self.options(trial)
         config = replace(
             self.training, features=trial.features, feature_options=options, seed=trial.seed, split=None
@@ -253,9 +277,10 @@ class PaperWork:
         """What the trial found: accuracies, or errors [cm]; and the seconds that it took to train."""
         batch = _levered_once(self.data, self.fingerprint)
         split = split_of(trial, batch, self.recipe.proportional)
-        config = self.recipe.configure(trial) if trial.features in FEATURES else self.recipe.training
+        named = EXPERIMENTS[trial.experiment].names_corners
+        config = self.recipe.training if named else self.recipe.configure(trial)
         with thread_count(config.threads):
-            if EXPERIMENTS[trial.experiment].names_corners:
+            if named:
                 started = perf_counter()
                 options = self.recipe.options(trial)
                 found = support_point_metrics(trial.features, batch, split, trial.seed, **options)
@@ -286,15 +311,18 @@ def measure_errors(
         inputs: The inputs of its features for that.
 
     Returns:
-        ``full`` and ``final``, means over the interactions; ``full_median`` and ``final_median``.
+        ``full`` and ``final``, means over the interactions; ``full_median`` and ``final_median``. Of a predictor of
+        poses also ``rotation`` and ``rotation_median`` [degrees], and ``add`` and ``add_median`` [cm].
     """
-    first = rest_states(batch.com[:, 0], predictor.state)
     features = predictor.add_known(
         predictor.compute_features(inputs), observed_values(batch, predictor.known)
     )
-    imagined = predictor.imagine_states(features, first)[..., :3]
-    truth = np.where(valid_samples(batch)[..., None], batch.com, np.nan)
-    errors = {name: 100 * np.asarray(distance(imagined, truth)) for name, distance in METRICS.items()}
+    imagined = predictor.imagine_effects(features, batch.com[:, 0])
+    valid = valid_samples(batch)
+    truth = np.where(valid[..., None], batch.com, np.nan)
+    errors = {name: 100 * np.asarray(distance(imagined.com, truth)) for name, distance in METRICS.items()}
+    if imagined.pose is not None:
+        errors |= pose_errors(imagined.pose, batch, valid)
     means = {name: float(np.mean(values)) for name, values in errors.items()}
     return means | {f"{name}_median": float(np.median(values)) for name, values in errors.items()}
 

@@ -2,14 +2,17 @@
 
 from foretrace.predictor.base import EffectPredictor, ImaginedBatch, ImaginedEffect
 from foretrace.predictor.checkpoint import PREDICTORS, load_predictor, save_checkpoint
+from foretrace.predictor.futures import Futures
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.run_folder import part_of
-from foretrace.predictor.training import TrainConfig, train_predictor
+from foretrace.predictor.training import RECIPES, TrainConfig, train_predictor
 
 __all__ = [
     "PREDICTORS",
+    "RECIPES",
     "EffectPredictor",
+    "Futures",
     "ImaginedBatch",
     "ImaginedEffect",
     "LstmConfig",

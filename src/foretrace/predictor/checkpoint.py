@@ -27,7 +27,7 @@ PREDICTORS: dict[str, tuple[Callable[..., EffectPredictor], type[LstmConfig] | t
     OneShotPredictor.label: (OneShotPredictor, OneShotConfig),
 }
 """Every kind of predictor by its label, with the class of its settings."""
-ADDED_SETTINGS: dict[str, Any] = {"known": (), "predictor": "lstm"}
+ADDED_SETTINGS: dict[str, Any] = {"known": (), "predictor": "lstm", "predictor_options": {}}
 """Settings that older checkpoints and results do not name, and what they were in effect."""
 
 

@@ -1,6 +1,6 @@
 """A predictor that says whole motions at once, what may happen instead, and how sure it is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -58,6 +58,8 @@ class OneShotConfig:
     """Principal motions of the training part that the networks put a trajectory together from."""
     hinges: int = 2
     """Edges that it considers: the one ahead of the centre of mass, and its neighbour."""
+    mirrored: bool = True
+    """Whether every lever-up is also seen in the mirror."""
     known: tuple[str, ...] = ()
     """Physical constants that it is told beside the view."""
     outcomes: tuple[str, ...] = ("levered",)
@@ -312,7 +314,10 @@ class OneShotPredictor(EffectPredictor):
         if self.heights:
             heights = features[:, 2 * MAX_CORNERS : self.features.num_features] * UNIT
             heights = heights.unflatten(1, (HEIGHT_CELLS, HEIGHT_CELLS))
-        return find_hinges(corners, com, self.settings.hinges, heights)
+        hinges = find_hinges(corners, com, self.settings.hinges, heights)
+        if self.settings.mirrored:
+            return hinges
+        return replace(hinges, values=hinges.values[:, :1], axes=hinges.axes[:, :1])
 
     def _say(self, features: Float[Tensor, "batch inputs"], hinges: Hinges) -> Said:
         values = (hinges.values - self.value_mean) / self.value_scale
@@ -323,19 +328,33 @@ class OneShotPredictor(EffectPredictor):
         said = self.networks(rows).unflatten(1, values.shape[:3]).unflatten(-1, (len(self.outcomes), -1))
         return Said(said[..., :-2], said[..., -2], said[..., -1])
 
-    def mixture(self, features: Float[Tensor, "batch inputs"], com: Float[Tensor, "batch 3"]) -> Mixture:
-        """What members and mirror images say about each future, averaged."""
+    def mixture(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        com: Float[Tensor, "batch 3"],
+        root: Float[Tensor, "outcomes motions motions"] | None = None,
+    ) -> Mixture:
+        """What members and mirror images say about each future, averaged.
+
+        Args:
+            features: As from `add_known`.
+            com: Centres of mass at rest in the action frame [m].
+            root: The Cholesky factors of ``covariance``, where somebody has them at hand.
+        """
+        root = torch.linalg.cholesky(self.covariance) if root is None else root
         hinges = self._see(features, com)
         said = self._say(features, hinges)
         weights, error = said.weights.mean(dim=0), said.error.mean(dim=(0, 2)).exp() * self.state_scale[0]
         odds = said.odds.flatten(3).log_softmax(dim=-1).view_as(said.odds).mean(dim=(0, 2))
+        # What the motion in the mirror is here.
+        seen = torch.stack([torch.ones_like(self.parity), self.parity])[: weights.shape[1]]
         return Mixture(
             com=com,
             axes=hinges.axes[:, 0],
             ends=hinges.ends,
             odds=odds.flatten(1).log_softmax(dim=1).view_as(odds),
-            mean=(weights[:, 0] + self.parity * weights[:, 1]) / 2,
-            factor=error[..., None, None] * torch.linalg.cholesky(self.covariance),
+            mean=(weights * seen[:, None, None]).mean(dim=1),
+            factor=error[..., None, None] * root,
             motions=self.motions,
             mean_motion=self.mean_motion,
             observed=no_observations(com),

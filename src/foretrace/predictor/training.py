@@ -5,10 +5,10 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -82,7 +82,9 @@ class TrainConfig:
     """Threads of PyTorch on the CPU; None leaves its choice. More than the idle cores make it slower."""
     predictor: str = "lstm"
     """What kind of predictor: a label of PREDICTORS. ``one-shot`` needs the features ``outline``, always predicts
-    poses, and of the settings of networks looks at ``hidden`` alone."""
+    poses, and of the settings of networks looks at ``hidden`` and ``predictor_options``."""
+    predictor_options: dict[str, Option] = field(default_factory=dict)
+    """Further settings of the one-shot predictor, by their names in `OneShotConfig`."""
 
     def __post_init__(self) -> None:
         for name in ("steps_ahead", "hidden", "window", "epochs", "min_steps", "batch_size"):
@@ -102,13 +104,31 @@ class TrainConfig:
         """The untrained predictor that these settings ask for."""
         features = make_features(self.features, **self.feature_options)
         if self.predictor == OneShotPredictor.label:
-            return OneShotPredictor(
-                features, num_samples, OneShotConfig(self.hidden, known=self.known, outcomes=self.outcomes)
+            allowed = {f.name for f in fields(OneShotConfig)} - {"hidden", "known", "outcomes"}
+            if odd := sorted(self.predictor_options.keys() - allowed):
+                raise TrainingError(
+                    f"the one-shot predictor has no option {odd[0]!r}; it has: {', '.join(sorted(allowed))}"
+                )
+            chosen: dict[str, Any] = dict(self.predictor_options)
+            shot = OneShotConfig(self.hidden, known=self.known, outcomes=self.outcomes, **chosen)
+            return OneShotPredictor(features, num_samples, shot)
+        if self.predictor_options:
+            raise TrainingError(
+                f"the {self.predictor} predictor has no further options: leave out predictor_options"
             )
         settings = LstmConfig(
             self.state, self.steps_ahead, self.hidden, self.window, self.residual, self.known
         )
         return LstmPredictor(features, num_samples, settings)
+
+
+RECIPES = {
+    "lstm": TrainConfig(),
+    "one-shot": TrainConfig(
+        predictor="one-shot", features="outline", hidden=128, epochs=100, learning_rate=4e-3
+    ),
+}
+"""What a kind of predictor is trained with, unless somebody asks for something else; keys are those of PREDICTORS."""
 
 
 @dataclass(frozen=True)
