@@ -13,6 +13,8 @@ from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.perception.markers import (
+    Detections,
+    MarkerBody,
     dictionary,
     fitting_dictionaries,
     grey,
@@ -26,6 +28,10 @@ FEWEST_CORNERS = 8
 """A picture counts that shows at least so many inner corners of the board."""
 LARGEST_ERROR = 1.0
 """A calibration that misses the corners by more than this is refused [pixel]."""
+LOOSEST_FOCUS = 0.02
+"""A focal length less certain than by this part of it is not believed."""
+FARTHEST_FOCUS = 0.2
+"""Nor one that is further from the stated one than this part of it."""
 LEAST_TILT = np.deg2rad(10.0)
 """Some pictures must see the board slanted by at least this, or the focal length stays unknown [rad]."""
 PAPER = 0.02
@@ -275,3 +281,47 @@ def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
     return bool(
         len(points) >= 4 and np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), 1e-6) == 2
     )
+
+
+def refine_camera(
+    detections: Sequence[Detections], body: MarkerBody, camera: PinholeCamera
+) -> tuple[PinholeCamera, float]:
+    """The camera whose focal lengths and first radial distortion explain best how known markers look.
+
+    For pictures that were taken or straightened with a camera file that is not quite theirs. A board tells more.
+
+    Args:
+        detections: The markers in each picture; the body must be seen from several sides.
+        body: The markers.
+        camera: The camera as far as it is known.
+
+    Returns:
+        The camera, and the root mean square of the reprojection error that remains [pixel].
+
+    Raises:
+        PerceptionError: The pictures do not tell: too few, or too much alike.
+    """
+    matches = [match for seen in detections if len((match := body.matches(seen))[0])]
+    if len(matches) < FEWEST_PICTURES:
+        raise PerceptionError(
+            f"markers {body.ids} are in {len(matches)} pictures, {FEWEST_PICTURES} are needed"
+        )
+    if len(camera.distortion) > 5:
+        raise PerceptionError(
+            "a camera with 8 distortion coefficients cannot be refined: calibrate it with a board"
+        )
+    points, pixels = ([part.astype(np.float32) for part in parts] for parts in zip(*matches, strict=True))
+    held = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_TANGENT_DIST
+    held |= cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    lens = np.array([*camera.distortion, *np.zeros(5 - len(camera.distortion))])
+    error, matrix, lens, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
+        points, pixels, (camera.width, camera.height), camera.matrix, lens, flags=held
+    )
+    loose = np.ravel(deviations)[:2].max() > LOOSEST_FOCUS * camera.fx
+    if not np.isfinite(error) or loose or abs(matrix[0, 0] / camera.fx - 1) > FARTHEST_FOCUS:
+        raise PerceptionError(
+            f"{len(matches)} pictures of markers {body.ids} leave the focal length open: slant them more, both ways"
+        )
+    fx, fy = (float(matrix[k, k]) for k in (0, 1))
+    found = tuple(float(value) for value in np.ravel(lens)[:5])
+    return PinholeCamera(camera.width, camera.height, fx, fy, camera.cx, camera.cy, found), float(error)

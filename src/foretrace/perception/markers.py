@@ -250,8 +250,7 @@ class MarkerBody:
     def poses(self, detections: Detections, camera: PinholeCamera) -> list[PoseCandidate]:
         """Poses that explain the seen markers, the best first: none, one or two.
 
-        The two solutions of the largest marker (Collins and Bartoli, 2014); with several markers in sight each is
-        refined on all corners.
+        The two solutions of the largest marker (Collins and Bartoli, 2014), each refined on all corners that are seen.
         """
         sizes = {id: shortest_side(corners) for id in self.ids if (corners := detections.of(id)) is not None}
         sizes = {id: size for id, size in sizes.items() if size >= SMALLEST_SIDE}
@@ -268,11 +267,10 @@ class MarkerBody:
         found = []
         for rvec, tvec in zip(rvecs, tvecs, strict=True):
             T = to_transform(rvec, tvec) @ T_marker_body
-            if len(sizes) > 1:
-                rotation, _ = cv2.Rodrigues(T[:3, :3])
-                T = to_transform(
-                    *cv2.solvePnPRefineLM(points, pixels, matrix, coefficients, rotation, T[:3, 3:].copy())
-                )
+            rotation, _ = cv2.Rodrigues(T[:3, :3])
+            T = to_transform(
+                *cv2.solvePnPRefineLM(points, pixels, matrix, coefficients, rotation, T[:3, 3:].copy())
+            )
             error = np.linalg.norm(camera.project(points, T) - pixels, axis=1)
             seen_from = invert_transform(T @ self.placements[largest])[:3, 3]
             slant = np.arcsin(seen_from[2] / np.linalg.norm(seen_from))
