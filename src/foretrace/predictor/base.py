@@ -345,12 +345,14 @@ class EffectPredictor(nn.Module, ABC):
 def _evaluating(module: nn.Module) -> Iterator[None]:
     """Without dropout and gradients for a while."""
     was_training = module.training
-    module.eval()
+    if was_training:
+        module.eval()
     try:
         with torch.no_grad():
             yield
     finally:
-        module.train(was_training)
+        if was_training:
+            module.train()
 
 
 def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
