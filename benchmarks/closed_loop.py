@@ -165,24 +165,11 @@ def save_picture(
         corners = detect_markers(frame.picture, layout.dictionary).corners
         # Drawn large: the paths are a few centimetres long.
         large = cv2.resize(frame.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        drawn = draw_overlay(large, enlarged(camera), found.T_table_camera, outline, paths, 2 * corners + 0.5)
+        drawn = draw_overlay(large, camera.scaled(2), found.T_table_camera, outline, paths, 2 * corners + 0.5)
         halves.append(drawn[: 2 * 600, 2 * 240 : 2 * 1040])
     out.parent.mkdir(parents=True, exist_ok=True)
     both = cv2.resize(np.hstack(halves), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(out), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
-
-
-def enlarged(camera: PinholeCamera) -> PinholeCamera:
-    """The camera of pictures of twice the size."""
-    return PinholeCamera(
-        2 * camera.width,
-        2 * camera.height,
-        2 * camera.fx,
-        2 * camera.fy,
-        2 * camera.cx + 0.5,
-        2 * camera.cy + 0.5,
-        camera.distortion,
-    )
 
 
 def judge_simulated(data: Path) -> dict:

@@ -20,8 +20,9 @@ from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
 from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
-from foretrace.cli.export import export_lerobot, export_rerun, export_rosbag
+from foretrace.cli.export import export_lerobot, export_onnx, export_rerun, export_rosbag
 from foretrace.cli.figures import figures
+from foretrace.cli.film import film
 from foretrace.cli.learning import predict, train
 from foretrace.cli.non_flat import evaluate_non_flat
 from foretrace.cli.randomisation import evaluate_randomisation
@@ -30,6 +31,7 @@ from foretrace.cli.recordings import import_recording
 from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.robot import robot
 from foretrace.cli.transfer import evaluate_transfer
+from foretrace.cli.uncertainty import evaluate_uncertainty
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -59,19 +61,21 @@ COMMANDS: dict[str, Command | Group] = {
             "replay": evaluate_replay,
             "transfer": evaluate_transfer,
             "non-flat": evaluate_non_flat,
+            "uncertainty": evaluate_uncertainty,
         },
     ),
     "figures": figures,
     "predict": predict,
     "export": Group(
-        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot.",
-        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot},
+        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot; predictors for ONNX.",
+        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot, "onnx": export_onnx},
     ),
     "show": show,
     "describe": describe,
     "doctor": doctor,
     "calibrate": calibrate,
     "capture": capture,
+    "film": film,
     "import": import_recording,
     "robot": robot,
 }

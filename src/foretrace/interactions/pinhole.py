@@ -69,6 +69,12 @@ class PinholeCamera:
         """The distortion as OpenCV wants it."""
         return np.array(self.distortion or np.zeros(4), dtype=float)
 
+    def scaled(self, factor: float) -> "PinholeCamera":
+        """The camera of pictures that are enlarged by a factor."""
+        size = (round(factor * self.width), round(factor * self.height))
+        centre = (factor * (self.cx + 0.5) - 0.5, factor * (self.cy + 0.5) - 0.5)
+        return PinholeCamera(*size, factor * self.fx, factor * self.fy, *centre, self.distortion)
+
     def project(
         self, points: Float[np.ndarray, "k 3"], T_camera_frame: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "k 2"]:

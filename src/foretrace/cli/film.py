@@ -1,0 +1,108 @@
+"""The command that films a simulated lever-up, for whoever has no camera and no robot."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tyro.conf import Positional
+
+from foretrace.cli.console import say
+
+if TYPE_CHECKING:
+    from foretrace.interactions.pinhole import PinholeCamera
+
+
+def film(
+    data: Positional[Path],
+    id: Positional[int],
+    out: Path,
+    width: int = 1280,
+    fps: float = 30.0,
+    slant: float = 0.6,
+    azimuth: float = 1.0,
+    distance: float = 0.7,
+    depth_every: int = 10,
+    embodiment: Literal["tool", "arm"] | None = None,
+    board: int = 0,
+    seed: int = 0,
+) -> None:
+    """Film a lever-up of a data set, simulated anew, as a camera above a real table would: a folder for `import`.
+
+    The film has a lens, blur, noise and changing light, markers on table and object, and a picture of the empty table.
+    What it shows exactly is in truth.json, which `import` does not read.
+
+    Args:
+        data: Folder of the data set.
+        id: Number of the interaction.
+        out: Folder to make.
+        width: Columns of the pictures; they have 9/16 as many rows.
+        fps: Frames per second.
+        slant: Angle of the camera's line of sight from the vertical [rad].
+        azimuth: Where the camera stands, from the action's direction towards its left [rad].
+        distance: From the camera to the point on the table that it looks at [m].
+        depth_every: Keep depth with every so many pictures; 0: never.
+        embodiment: What moves the blade: nothing that is seen, or the whole arm; by default as in the data set.
+        board: Film so many pictures of a calibration board, too, and leave the camera's file to `calibrate`.
+        seed: Seed of noise, clock, and of where the marker sits.
+    """
+    import json
+
+    import numpy as np
+
+    from foretrace.errors import DatasetError, PerceptionError
+    from foretrace.geometry import invert_transform
+    from foretrace.interactions import film_folder
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.simulation.film import FilmConfig, film_lever_up
+    from foretrace.simulation.lens import WEBCAM
+    from foretrace.simulation.lever_up import SimulationConfig
+
+    if out.exists() and any(out.iterdir()):
+        raise PerceptionError(f"{out} is in use: choose another folder")
+    dataset = Dataset.open(data)
+    rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
+    if len(rows) == 0:
+        raise DatasetError(
+            f"{data} has no interaction {id} with a motion: `foretrace describe` tells what it has"
+        )
+    shown = dataset[int(rows[0])]
+    camera = WEBCAM.scaled(width / WEBCAM.width)
+    recorded = dataset.manifest["configuration"].get("simulation", {})
+    simulation = SimulationConfig(
+        embodiment=embodiment or recorded.get("embodiment", "tool"), physics=shown.physics
+    )
+    config = FilmConfig(camera, distance, slant, azimuth, fps, depth_every=depth_every, simulation=simulation)
+    obj, action = shown.object, shown.action
+    if board:
+        _film_board(out / "board", board, camera, seed)
+    truth = film_lever_up(obj, action, out, config, seed=seed)
+    (out / film_folder.OBJECT).write_text(json.dumps(obj.to_dict()) + "\n", encoding="utf-8")
+    intrinsics = out / film_folder.CAMERA
+    if not board:
+        camera.save(intrinsics)
+    rim = truth.T_table_object[0] @ np.array([*action.contact, obj.height, 1.0])
+    column, row = camera.project(rim[None, :3], invert_transform(truth.T_table_camera))[0]
+    x, y = action.contact
+    away = np.linalg.norm(truth.interaction.effect.com_trajectory[-1] - shown.effect.com_trajectory[-1])
+    say(
+        f"{truth.interaction.effect.outcome}; the object ends {1000 * away:.1f} mm from where it does in {data}"
+    )
+    print(f"{len(truth.times)} frames: {out}")
+    if board:
+        print(
+            f"{board} pictures of a board: {out / 'board'}; foretrace calibrate {out / 'board'} --out {intrinsics}"
+        )
+    print(f"contact: --contact {x:.4f} {y:.4f}, in the first frame --contact-px {column:.0f} {row:.0f}")
+
+
+def _film_board(folder: Path, num: int, camera: "PinholeCamera", seed: int) -> None:
+    """Pictures of the usual calibration board."""
+    import cv2
+
+    from foretrace.perception.calibration import Board
+    from foretrace.simulation.film import film_board
+
+    folder.mkdir(parents=True)
+    printed = Board()
+    pictures = film_board(printed.draw(4000.0), printed.size, camera, num, seed=seed)
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number:02d}.png"), picture)

@@ -1,0 +1,76 @@
+"""From a data set through a camera to a data set: films of `foretrace film`, imported, learned from and judged by."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foretrace.cli import main
+from foretrace.interactions.dataset import Dataset
+from foretrace.perception.films import open_film
+from foretrace.predictor import TrainConfig, load_predictor, train_predictor
+from foretrace.trajectories import mean_distance
+
+pytestmark = pytest.mark.slow
+
+QUICK = ["--width", "800", "--fps", "10", "--distance", "0.55", "--depth-every", "40"]
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "simulated"
+    options = ["--objects", "8", "--contacts-per-edge", "1", "--embodiment", "tool", "--workers", "1"]
+    assert main(["simulate", "--out", str(folder), *options]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recorded(simulated: Path) -> Path:
+    """Two films, the first of them imported twice."""
+    out = simulated.parent / "recorded"
+    data = Dataset.open(simulated)
+    levered = np.flatnonzero(data.batch().outcome == "levered")[[4, 7]]
+    for number, row in enumerate(levered.tolist()):
+        film = simulated.parent / f"film-{number}"
+        if main(["film", str(simulated), str(data[row].id), "--out", str(film), *QUICK]):
+            pytest.skip("this machine cannot render")
+        x, y = data[row].action.contact
+        command = ["import", str(film), "--object", str(film / "object.json"), "--contact", str(x), str(y)]
+        for _ in range(2 - number):
+            assert main([*command, "--out", str(out)]) == 0
+    return out
+
+
+def test_films_of_a_data_set_come_back_as_they_were(simulated: Path, recorded: Path) -> None:
+    data, found = Dataset.open(simulated), Dataset.open(recorded)
+    levered = np.flatnonzero(data.batch().outcome == "levered")[[4, 7]]
+    assert len(found) == 3
+    for row, at in ((0, 0), (1, 0), (2, 1)):
+        truth, effect = data[int(levered[at])].effect, found[row].effect
+        assert effect.outcome == "levered"
+        np.testing.assert_allclose(np.diff(effect.times), 0.05, atol=1e-9)  # filmed 10 times a second
+        n = len(effect.times)
+        assert mean_distance(effect.com_trajectory, truth.com_trajectory[:n]) < 0.004
+    film = open_film(simulated.parent / "film-0")
+    assert film.camera is not None
+    assert [frame.depth is not None for frame in film.frames()][:2] == [True, False]
+
+
+def test_recordings_are_learned_from_and_judged_like_simulations(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = TrainConfig(features="none", epochs=1, min_steps=1, split=(1, 1, 1), threads=1)
+    train_predictor(Dataset.open(recorded), config, tmp_path / "run")
+    assert main(["evaluate", "predictor", str(tmp_path / "run"), "--data", str(recorded)]) == 0
+    assert "levered" in capsys.readouterr().out
+    imagined = load_predictor(tmp_path / "run").imagine_batch(Dataset.open(recorded).batch())
+    assert all(np.isfinite(one.com_trajectory).all() for one in imagined)
+    assert main(["show", str(recorded), "--out", str(tmp_path / "all.png")]) == 0
+    assert (tmp_path / "all.png").stat().st_size > 1000
+
+
+def test_a_film_of_nothing(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["film", str(simulated), "99999", "--out", str(tmp_path / "film")]) == 2
+    assert "has no interaction 99999 with a motion" in capsys.readouterr().err
+    assert main(["film", str(simulated), "0", "--out", str(simulated)]) == 2
+    assert "is in use: choose another folder" in capsys.readouterr().err
