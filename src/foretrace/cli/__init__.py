@@ -20,7 +20,7 @@ from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
 from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
-from foretrace.cli.export import export_lerobot, export_onnx, export_rerun, export_rosbag
+from foretrace.cli.export import export_lerobot, export_rerun, export_rosbag
 from foretrace.cli.figures import figures
 from foretrace.cli.film import film
 from foretrace.cli.learning import predict, train
@@ -31,7 +31,6 @@ from foretrace.cli.recordings import import_recording
 from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.robot import robot
 from foretrace.cli.transfer import evaluate_transfer
-from foretrace.cli.uncertainty import evaluate_uncertainty
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -61,14 +60,13 @@ COMMANDS: dict[str, Command | Group] = {
             "replay": evaluate_replay,
             "transfer": evaluate_transfer,
             "non-flat": evaluate_non_flat,
-            "uncertainty": evaluate_uncertainty,
         },
     ),
     "figures": figures,
     "predict": predict,
     "export": Group(
-        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot; predictors for ONNX.",
-        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot, "onnx": export_onnx},
+        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot.",
+        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot},
     ),
     "show": show,
     "describe": describe,
