@@ -24,6 +24,7 @@ from foretrace.perception.markers import (
     picture_fault,
     square,
 )
+from foretrace.perception.overlay import PREDICTED, draw_overlay
 
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "markers"
 CAMERA = PinholeCamera(640, 480, 600.0, 604.0, 322.0, 236.0, (0.08, -0.15, 0.001, -0.001, 0.05))
@@ -299,3 +300,19 @@ def test_a_camera_is_refined_from_markers() -> None:
     body, flat = looks(true, [0.01] * 6)
     with pytest.raises(PerceptionError, match="leave the focal length open: slant them more"):
         refine_camera(flat, body, stated)
+
+
+def test_an_uncertain_path_is_drawn_as_a_tube() -> None:
+    camera, grey = PinholeCamera(320, 240, 200.0, 200.0, 159.5, 119.5), np.full((240, 320, 3), 128, np.uint8)
+    path = np.column_stack([np.linspace(-0.1, 0.1, 9), np.zeros(9), np.full(9, 0.5)])
+    radius = np.linspace(0.01, 0.05, 9)
+    paths = {"predicted": (path, PREDICTED)}
+    bare = draw_overlay(grey, camera, np.eye(4), paths=paths)
+    drawn = draw_overlay(grey, camera, np.eye(4), paths=paths, radii={"predicted": radius})
+    column = lambda picture, x: np.flatnonzero((picture[40:, round(159.5 + 400 * x)] != 128).any(axis=1))  # noqa: E731
+    assert np.ptp(column(bare, 0.1)) < 6
+    assert np.ptp(column(drawn, 0.1)) == pytest.approx(2 * 200 * 0.05 / 0.5, abs=3)
+    assert np.ptp(column(drawn, -0.1)) == pytest.approx(2 * 200 * 0.01 / 0.5, abs=3)
+    assert (
+        draw_overlay(grey, camera, np.eye(4), paths=paths, radii={"predicted": np.full(9, np.nan)}) == bare
+    ).all()

@@ -65,6 +65,15 @@ def test_recordings_are_learned_from_and_judged_like_simulations(
     assert "levered" in capsys.readouterr().out
     imagined = load_predictor(tmp_path / "run").imagine_batch(Dataset.open(recorded).batch())
     assert all(np.isfinite(one.com_trajectory).all() for one in imagined)
+    pytest.importorskip("imageio_ffmpeg")
+    video = tmp_path / "overlay.mp4"
+    assert main(["overlay", str(recorded), "0", "--run", str(tmp_path / "run"), "--out", str(video)]) == 0
+    shown, film = list(open_film(video).frames()), list(open_film(recorded.parent / "film-0").frames())
+    assert len(shown) == len(film)
+    changed = np.abs(shown[-1].picture.astype(int) - film[-1].picture).max(axis=2) > 80
+    assert 100 < changed.sum() < 0.1 * changed.size
+    assert main(["overlay", str(recorded), "9", "--run", str(tmp_path / "run"), "--out", str(video)]) == 2
+    assert "has no recording 9" in capsys.readouterr().err
     assert main(["show", str(recorded), "--out", str(tmp_path / "all.png")]) == 0
     assert (tmp_path / "all.png").stat().st_size > 1000
 

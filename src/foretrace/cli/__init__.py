@@ -25,6 +25,7 @@ from foretrace.cli.figures import figures
 from foretrace.cli.film import film
 from foretrace.cli.learning import predict, train
 from foretrace.cli.non_flat import evaluate_non_flat
+from foretrace.cli.overlay import overlay
 from foretrace.cli.randomisation import evaluate_randomisation
 from foretrace.cli.reconstruction import evaluate_reconstruction
 from foretrace.cli.recordings import import_recording
@@ -75,6 +76,7 @@ COMMANDS: dict[str, Command | Group] = {
     "capture": capture,
     "film": film,
     "import": import_recording,
+    "overlay": overlay,
     "robot": robot,
 }
 """Every command by its name."""

@@ -1,0 +1,89 @@
+"""The command that draws prediction and observation over a film that was imported."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from foretrace.interactions.record import Interaction
+    from foretrace.predictor.base import ImaginedEffect
+
+
+def overlay(
+    data: Positional[Path], id: Positional[int], run: Path, out: Path, topic: str | None = None
+) -> None:
+    """Draw what a predictor expects and what was observed over an imported film, frame by frame, as an MP4.
+
+    Red: predicted, before the touch. Green: observed so far. White: the object's outline. A translucent tube: how
+    uncertain the prediction is, where the predictor says so. Needs foretrace[video], and the film where it was when it
+    was imported.
+
+    Args:
+        data: Folder of the recorded data set.
+        id: Number of the interaction.
+        run: Folder of the training.
+        out: The .mp4 file to write.
+        topic: Image topic of a bag, if it has several.
+    """
+    import json
+
+    import numpy as np
+
+    from foretrace.errors import DatasetError, PerceptionError
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.interactions.recorded import NOTES_FOLDER
+    from foretrace.perception.films import open_film
+    from foretrace.perception.overlay import write_video
+    from foretrace.predictor import load_predictor
+
+    if out.suffix.lower() != ".mp4":
+        raise PerceptionError(f"cannot write a film to {out}: choose a name that ends in .mp4")
+    dataset = Dataset.open(data)
+    rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
+    notes = data / NOTES_FOLDER / f"{id:05d}.json"
+    if len(rows) == 0 or not notes.is_file():
+        raise DatasetError(f"{data} has no recording {id}: give a data set that `foretrace import` made")
+    row = int(rows[0])
+    said = json.loads(notes.read_text(encoding="utf-8"))
+    imagined = load_predictor(run).imagine_batch(dataset[row : row + 1].batch())[0]
+    film = open_film(said["recording"], topic)
+    times = np.array(said["frame_times"])
+    pictures = _drawn(film.frames(), said, dataset[row], imagined)
+    count = write_video(out, pictures, float(1 / np.median(np.diff(times))))
+    print(f"{count} frames: {out}")
+
+
+def _drawn(
+    frames: "Iterator[Any]", notes: dict[str, Any], interaction: "Interaction", imagined: "ImaginedEffect"
+) -> "Iterator[np.ndarray]":
+    """The film's pictures with outline and paths in them."""
+    import numpy as np
+
+    from foretrace.geometry import pose_to_matrix, transform_points
+    from foretrace.interactions.pinhole import PinholeCamera
+    from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
+    from foretrace.perception.tracking import slerp
+
+    camera = PinholeCamera.from_dict(notes["camera"], "the recording's camera")
+    T_action_camera = np.array(notes["T_action_camera"])
+    obj, effect = interaction.object, interaction.effect
+    rim = np.column_stack([obj.corners, np.full(len(obj.corners), obj.height)])
+    poses = pose_to_matrix(effect.pose_trajectory)
+    radius = getattr(imagined, "radius", None)
+    for frame in frames:
+        time = frame.time - notes["start"]
+        here = np.eye(4)
+        here[:3, 3] = [np.interp(time, effect.times, poses[:, axis, 3]) for axis in range(3)]
+        here[:3, :3] = slerp(effect.times, poses[:, :3, :3], np.array([time]))[0]
+        paths = {
+            "predicted": (imagined.com_trajectory, PREDICTED),
+            "observed": (effect.com_trajectory[effect.times <= max(time, 0.0)], OBSERVED),
+        }
+        radii = None if radius is None else {"predicted": np.asarray(radius, dtype=float)}
+        yield draw_overlay(
+            frame.picture, camera, T_action_camera, transform_points(here, rim), paths, radii=radii
+        )
