@@ -11,7 +11,7 @@ $(STAMP): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,docs,video]'
-	for package in pybullet pyrealsense2 rerun-sdk rosbags ur_rtde; do \
+	for package in pybullet pyrealsense2 rerun-sdk rosbags ur_rtde onnx onnxruntime onnxscript; do \
 		$(BIN)/pip install --quiet --constraint constraints.txt --only-binary :all: $$package \
 			|| echo "no $$package for this Python: its tests are skipped"; \
 	done

@@ -20,7 +20,7 @@ from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
 from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
-from foretrace.cli.export import export_lerobot, export_rerun, export_rosbag
+from foretrace.cli.export import export_lerobot, export_onnx, export_rerun, export_rosbag
 from foretrace.cli.figures import figures
 from foretrace.cli.film import film
 from foretrace.cli.learning import predict, train
@@ -66,8 +66,8 @@ COMMANDS: dict[str, Command | Group] = {
     "figures": figures,
     "predict": predict,
     "export": Group(
-        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot.",
-        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot},
+        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot; predictors for ONNX.",
+        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot, "onnx": export_onnx},
     ),
     "show": show,
     "describe": describe,

@@ -1,7 +1,9 @@
-"""Commands that write interactions for other tools: export rosbag, rerun, lerobot."""
+"""Commands that write interactions for other tools, and predictors: export rosbag, rerun, lerobot, onnx."""
 
 from pathlib import Path
 from typing import Literal
+
+from tyro.conf import Positional
 
 ROS, RERUN = ("rosbags", "ros"), ("rerun", "rerun")
 """Libraries that are not installed by default, and the extras that bring them."""
@@ -80,6 +82,24 @@ def export_lerobot(
 
     export_lerobot(choose(data, ids, run), out, fps, camera)
     print(out)
+
+
+def export_onnx(run: Positional[Path], out: Path = Path("model.onnx")) -> None:
+    """Write a predictor's network as an ONNX file, and compare it with PyTorch. Needs foretrace[onnx].
+
+    Args:
+        run: Folder of the training.
+        out: File to write.
+    """
+    from foretrace.export.onnx import export_onnx
+    from foretrace.predictor import load_predictor
+
+    written = export_onnx(load_predictor(run), out)
+    for name, meaning in written.inputs.items():
+        print(f"reads {name}: {meaning}")
+    for name, meaning in written.outputs.items():
+        print(f"says {name}: {meaning}; at most {written.differences[name]:.1e} from PyTorch")
+    print(written.path)
 
 
 def _say_what_is_in(out: Path) -> None:

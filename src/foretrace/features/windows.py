@@ -27,22 +27,15 @@ def find_windows(images: Shaped[Tensor, "batch 1 height width"]) -> list[Part]:
     Returns:
         One or two parts, which have every image once.
     """
-    size = images.shape[2] // CELL, images.shape[3] // CELL
-    filled = (images != 0).unflatten(3, (size[1], CELL)).unflatten(2, (size[0], CELL))[:, 0]
-    filled = filled.any(4).any(2)  # (batch, rows, columns) of cells
-    (top, bottom), (left, right) = (_extent(filled.any(other)) for other in (2, 1))
-    rows, columns = min(WINDOW[0], size[0]), min(WINDOW[1], size[1])
-    fits = (bottom - top < rows) & (right - left < columns)
+    fits, corner, size = _find(images)
+    small = _window_size(size)
     parts = []
-    for chosen, extent in ((fits, (rows, columns)), (~fits, size)):
+    for chosen, extent in ((fits, small), (~fits, size)):
         index = chosen.nonzero()[:, 0]
         if len(index):
-            corner = top.clamp(max=size[0] - extent[0]), left.clamp(max=size[1] - extent[1])
-            cells = (
-                c[index, None] + torch.arange(n, device=index.device)
-                for c, n in zip(corner, extent, strict=True)
+            parts.append(
+                (index, *(_cells(c[index], n, m) for c, n, m in zip(corner, extent, size, strict=True)))
             )
-            parts.append((index, *cells))
     return parts
 
 
@@ -76,6 +69,49 @@ def convolve_windows(
     for part in find_windows(images):
         paste(maps, part, network(crop(images, part).float()).float())
     return maps
+
+
+def convolve_unbranched(
+    images: Shaped[Tensor, "batch 1 height width"], network: Callable[[Tensor], Tensor]
+) -> Shaped[Tensor, "batch channels rows columns"]:
+    """The maps of `convolve_windows` from the same operations for every image, as a graph in a file must have them.
+
+    Every image is convolved twice, whole and in its window, and one of the two is kept.
+    """
+    fits, (top, left), size = _find(images)
+    rows, columns = _window_size(size)
+    index = torch.arange(images.shape[0], device=images.device)
+    part = index, _cells(top, rows, size[0]), _cells(left, columns, size[1])
+    maps = network(crop(images, part))
+    # The windows' cells at their places: each cell of the whole map looks up where it lies in the window.
+    for dim, first, count in ((2, part[1][:, :1], rows), (3, part[2][:, :1], columns)):
+        place = torch.arange(size[dim - 2], device=images.device) - first  # (batch, cells)
+        place = place[:, None, :, None] if dim == 2 else place[:, None, None]
+        shape = [*maps.shape[:dim], size[dim - 2], *maps.shape[dim + 1 :]]
+        found = maps.gather(dim, place.clamp(0, count - 1).expand(shape))
+        maps = torch.where((place >= 0) & (place < count), found, 0.0)
+    return torch.where(fits[:, None, None, None], maps, network(images))
+
+
+def _find(
+    images: Shaped[Tensor, "batch 1 height width"],
+) -> tuple[Bool[Tensor, " batch"], tuple[Tensor, Tensor], tuple[int, int]]:
+    """Which images fit into a window; first rows and columns of cells that are not blank; how many cells there are."""
+    size = images.shape[2] // CELL, images.shape[3] // CELL
+    filled = (images != 0).unflatten(3, (size[1], CELL)).unflatten(2, (size[0], CELL))[:, 0]
+    filled = filled.any(4).any(2)  # (batch, rows, columns) of cells
+    (top, bottom), (left, right) = (_extent(filled.any(other)) for other in (2, 1))
+    rows, columns = _window_size(size)
+    return (bottom - top < rows) & (right - left < columns), (top, left), size
+
+
+def _window_size(size: tuple[int, int]) -> tuple[int, int]:
+    return min(WINDOW[0], size[0]), min(WINDOW[1], size[1])
+
+
+def _cells(first: Int[Tensor, " images"], count: int, size: int) -> Int[Tensor, "images cells"]:
+    """So many rows or columns of cells from the first on, all of them within the image."""
+    return first.clamp(max=size - count)[:, None] + torch.arange(count, device=first.device)
 
 
 def _extent(filled: Bool[Tensor, "batch cells"]) -> tuple[Int[Tensor, " batch"], Int[Tensor, " batch"]]:

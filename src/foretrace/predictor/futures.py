@@ -205,4 +205,4 @@ def along_hinges(
 
 def no_observations(com: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 0 6"]:
     """What was observed when nothing was."""
-    return com.new_zeros(len(com), 0, COORDINATES)
+    return com.new_zeros(com.shape[0], 0, COORDINATES)  # not len(com): an export takes that for a constant

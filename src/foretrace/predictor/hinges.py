@@ -80,7 +80,7 @@ def find_hinges(
         both(lift, lift * mirror[:2]),
         both(ray, ray * mirror[:2]),
     )
-    values, axes, ends = (part.unflatten(0, (len(com), 2)) for part in seen)
+    values, axes, ends = (part.unflatten(0, (-1, 2)) for part in seen)
     axes = torch.stack([axes[:, 0], axes[:, 1] * mirror], dim=1)
     if heights is not None:
         values = torch.cat([values, _probe(heights, corners, axes, ends[:, 0])], dim=-1)

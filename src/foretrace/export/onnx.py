@@ -1,0 +1,169 @@
+"""A predictor's network as an ONNX file, for programs that do without PyTorch; checked against PyTorch."""
+
+import json
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import foretrace
+from foretrace.errors import ExportError
+from foretrace.export.delivery import require
+from foretrace.export.networks import Network, network_of
+from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
+from foretrace.predictor import EffectPredictor
+from foretrace.predictor.checkpoint import describe
+
+LIBRARIES = ("onnx", "onnxscript", "onnxruntime")
+EXTRA = "onnx"
+OPSET = 20
+TOLERANCE = 1e-5
+"""Largest difference between what the file and PyTorch say: of positions [m], probabilities, entries of rotation
+matrices; of spreads [m] where a future is probable enough to count, and only up to ``LARGEST_SPREAD``."""
+LARGEST_SPREAD = 1.0
+"""Who is less sure than this [m] knows nothing: by how much does not matter."""
+BATCHES = (1, 2, 7, 32)
+"""Numbers of lever-ups at once that are compared."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What has been written."""
+
+    path: Path
+    """The file."""
+    inputs: dict[str, str]
+    """What the network reads, by name: what it is."""
+    outputs: dict[str, str]
+    """What it says."""
+    differences: dict[str, float] = field(default_factory=dict)
+    """Largest difference from PyTorch of each output, as ``TOLERANCE`` counts it."""
+
+
+def export_onnx(predictor: EffectPredictor, out: Path, seed: int = 0) -> Exported:
+    """Write a predictor's network, and compare what the file says with what PyTorch says.
+
+    Args:
+        predictor: The predictor.
+        out: The file; it appears under its name only if the two agree.
+        seed: Of the inputs that are compared.
+
+    Raises:
+        ExportError: A library is missing, the file exists or cannot be written, the network cannot be exported, or
+            the file says something else.
+    """
+    for library in LIBRARIES:
+        require(library, EXTRA)
+    if out.exists() or out.is_symlink():
+        raise ExportError(f"{out} exists already and is not overwritten: choose another --out, or remove it")
+    network = network_of(predictor)
+    draft = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    rng = np.random.default_rng(seed)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        _write(network, draft, rng)
+        differences = compare(network, draft, rng)
+        os.replace(draft, out)
+    except OSError as error:
+        raise ExportError(f"cannot write {out} ({error.strerror}): choose another --out") from error
+    finally:
+        draft.unlink(missing_ok=True)
+    return Exported(out, network.inputs, network.outputs, differences)
+
+
+def compare(network: Network, file: Path, rng: np.random.Generator) -> dict[str, float]:
+    """Largest difference of each output between ONNX Runtime and PyTorch, over noise and views of prisms.
+
+    Raises:
+        ExportError: One is larger than ``TOLERANCE``.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
+    worst = dict.fromkeys(network.outputs, 0.0)
+    for number in BATCHES:
+        for noise in (False, True):
+            inputs = network.draw(rng, number, noise)
+            said = dict(zip(network.outputs, map(np.asarray, session.run(None, inputs)), strict=True))
+            for name, expected in network.imagine(inputs).items():
+                worst[name] = float(np.maximum(worst[name], _difference(name, said[name], expected)))
+    for name, difference in worst.items():
+        if not difference <= TOLERANCE:  # not a number is too much, too
+            raise ExportError(
+                f"{name} of the exported network is {difference:.2g} away from PyTorch's, more than {TOLERANCE:g}: "
+                "nothing was written; try other versions of onnx and onnxruntime"
+            )
+    return worst
+
+
+def _difference(name: str, said: np.ndarray, expected: np.ndarray) -> float:
+    if name == "rotation_vector":  # quaternions and axes jump at half a turn, matrices do not
+        said = quaternion_to_matrix(rotation_vector_to_quaternion(said.astype(float)))
+    if name == "spread":  # infinite where it does not count
+        said = np.where(np.isinf(expected), np.inf, said)
+        said, expected = (np.minimum(spread, LARGEST_SPREAD) for spread in (said, expected))
+    return float(np.max(np.abs(said - expected)))
+
+
+def _write(network: Network, file: Path, rng: np.random.Generator) -> None:
+    import onnx
+
+    # A batch of one would be taken for a constant.
+    example = tuple(torch.from_numpy(values) for values in network.draw(rng, 2, noise=False).values())
+    batch = torch.export.Dim("batch")
+    try:
+        with _quiet(), torch.no_grad():
+            traced = torch.export.export(
+                network, example, dynamic_shapes=tuple({0: batch} for _ in example), strict=False
+            )
+            program = torch.onnx.export(
+                traced,
+                input_names=list(network.inputs),
+                output_names=list(network.outputs),
+                opset_version=OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    except (RuntimeError, ValueError) as error:
+        raise ExportError(
+            f"the {network.predictor.label} network with features {network.predictor.features.label!r} cannot be "
+            f"exported: {str(error).strip().splitlines()[0]}"
+        ) from error
+    assert program is not None
+    model = program.model_proto
+    graph = model.graph
+    for values, meanings in ((graph.input, network.inputs), (graph.output, network.outputs)):
+        for value in values:
+            value.type.tensor_type.shape.dim[0].dim_param = "batch"
+            value.doc_string = meanings[value.name]
+    model.producer_name, model.producer_version = "foretrace", foretrace.__version__
+    config = describe(network.predictor)
+    del config["format"], config["version"]
+    facts = config | network.facts() | {"inputs": network.inputs, "outputs": network.outputs}
+    onnx.helper.set_model_props(
+        model, {f"foretrace.{name}": json.dumps(fact) for name, fact in facts.items()}
+    )
+    onnx.checker.check_model(model)
+    onnx.save(model, file)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's remarks on libraries that nobody needs here."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

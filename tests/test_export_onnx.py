@@ -1,0 +1,198 @@
+import io
+import json
+import re
+from contextlib import redirect_stdout
+
+import numpy as np
+import pytest
+import torch
+
+from factories import fake_batch
+from foretrace import cli
+from foretrace.errors import ExportError
+from foretrace.export import onnx as exporting
+from foretrace.export.networks import network_of
+from foretrace.features import ImageCnn, Outline, make_features
+from foretrace.features.windows import convolve_unbranched, convolve_windows
+from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
+from foretrace.predictor import LstmConfig, LstmPredictor, OneShotConfig, OneShotPredictor, save_checkpoint
+from foretrace.predictor.base import estimate_com
+from foretrace.predictor.states import state_size
+from test_examples import EXAMPLES, run_python
+
+onnxruntime = pytest.importorskip("onnxruntime")
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+SAMPLES = 5
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+def shake(predictor, seed: int = 0):
+    """An untrained predictor as if it had learned something: no tensor is left at 0 or 1."""
+    rng = np.random.default_rng(seed)
+    state = {}
+    for name, tensor in predictor.state_dict().items():
+        noise = torch.from_numpy(rng.normal(size=tuple(tensor.shape))).to(tensor)
+        if name == "covariance":
+            state[name] = torch.eye(tensor.shape[-1]) + 0.1 * noise @ noise.mT
+        elif name in ("state_scale", "value_scale", "known_scale", "quantiles"):
+            state[name] = 0.1 + noise.abs()
+        elif name == "parity":
+            state[name] = noise.sign()
+        elif name == "times":
+            state[name] = 0.05 * torch.arange(len(tensor)).to(tensor)
+        else:
+            state[name] = (
+                tensor + (0.01 if name.endswith("motions") or name == "mean_motion" else 0.1) * noise
+            )
+    predictor.load_state_dict(state)
+    return predictor.eval()
+
+
+def one_shot() -> OneShotPredictor:
+    torch.manual_seed(0)
+    settings = OneShotConfig(8, 2, 2, 4, outcomes=("levered", "slipped"))
+    return shake(OneShotPredictor(Outline(heights=True), SAMPLES, settings))
+
+
+def image_cnn() -> LstmPredictor:
+    torch.manual_seed(0)
+    predictor = LstmPredictor(
+        make_features("im-cnn", width=8), SAMPLES, LstmConfig("pose", hidden=8, known=("friction",))
+    )
+    size = state_size("pose")
+    predictor.set_normalisation(np.full(size, 0.01), np.full(size, 0.3), 0.05 * np.arange(SAMPLES))
+    return predictor.eval()
+
+
+@pytest.fixture(scope="module")
+def command(tmp_path_factory):
+    """A one-shot predictor, the file that the command exports it to, and what it prints."""
+    folder = tmp_path_factory.mktemp("onnx")
+    predictor, file = one_shot(), folder / "model.onnx"
+    save_checkpoint(folder / "run", predictor)
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        assert cli.main(["export", "onnx", str(folder / "run"), "--out", str(file)]) == 0
+    return predictor, file, printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def views():
+    return fake_batch(np.random.default_rng(0), 6, num_samples=SAMPLES)
+
+
+def test_a_distribution_is_that_of_the_predictor(command, views):
+    predictor, file, _ = command
+    session = onnxruntime.InferenceSession(file)
+    names = [output.name for output in session.get_outputs()]
+    for rows in (slice(0, 1), slice(1, 4), slice(0, 6)):
+        features, com = predictor.features.inputs(views[rows]), estimate_com(views[rows])
+        inputs = {"features": features.numpy(), "com": com.astype(np.float32)}
+        said = dict(zip(names, session.run(None, inputs), strict=True))
+        futures = predictor.imagine_effects(features, com).futures
+        np.testing.assert_allclose(said["probability"], futures.probability, atol=1e-6)
+        np.testing.assert_allclose(said["com_trajectory"], futures.com, atol=1e-6)
+        np.testing.assert_allclose(said["spread"], futures.spread, rtol=1e-4)
+        np.testing.assert_allclose(said["support_points"], futures.support_points, atol=1e-6)
+        turned = quaternion_to_matrix(rotation_vector_to_quaternion(said["rotation_vector"].astype(float)))
+        np.testing.assert_allclose(turned, quaternion_to_matrix(futures.pose[..., 3:]), atol=1e-5)
+    assert futures.probability.std() > 0.01
+    assert np.ptp(futures.com, axis=(0, 1, 2)).min() > 0.001
+
+
+def test_the_command_says_what_it_measured_and_the_example_runs(command):
+    _, file, printed = command
+    measured = re.findall(r"^says (\w+): .*; at most (\d\.\de-\d+) from PyTorch$", printed, re.MULTILINE)
+    assert [name for name, _ in measured][:2] == ["probability", "com_trajectory"]
+    assert 0 < max(float(number) for _, number in measured) <= exporting.TOLERANCE
+    assert re.search(r"^\d+%: the centre of mass ends at \[", run_python(EXAMPLES / "run_onnx.py", file))
+
+
+def test_a_file_tells_what_it_is(command):
+    predictor, file, _ = command
+    model = onnx.load(file)
+    facts = {p.key.removeprefix("foretrace."): json.loads(p.value) for p in model.metadata_props}
+    assert facts["futures"] == ["levered", "slipped", "levered", "slipped"]
+    assert facts["times"] == predictor.times.tolist()
+    assert facts["predictor"] == "one-shot"
+    assert facts["quantiles"] == pytest.approx(predictor.quantiles.tolist())
+    assert facts["features"] == {"label": "outline", "options": {"heights": True}}
+    assert facts["frame"].startswith("action: origin at the contact point")
+    assert {i.name: i.doc_string for i in model.graph.input} == network_of(predictor).inputs
+    assert all(value.type.tensor_type.shape.dim[0].dim_param == "batch" for value in model.graph.output)
+    assert "Cholesky" not in "".join(node.op_type for node in model.graph.node)
+
+
+def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
+    predictor = image_cnn()
+    written = exporting.export_onnx(predictor, tmp_path / "model.onnx")
+    assert list(written.inputs) == ["mask", "com", "known"]
+    assert list(written.outputs) == ["com_trajectory", "rotation_matrix"]
+    assert max(written.differences.values()) <= exporting.TOLERANCE
+    session = onnxruntime.InferenceSession(written.path)
+    batch = fake_batch(np.random.default_rng(1), 3, num_samples=SAMPLES)
+    com = estimate_com(batch).astype(np.float32)
+    inputs = {"mask": batch.mask.astype(np.uint8), "com": com, "known": batch.friction[:, None].astype("f4")}
+    path, rotation = session.run(None, inputs)
+    imagined = predictor.imagine_batch(batch, "estimated")
+    np.testing.assert_allclose(path, imagined.com, atol=1e-5)
+    np.testing.assert_allclose(rotation, quaternion_to_matrix(imagined.pose[..., 3:]), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("label", "state"), [("none", "position"), ("sc-200", "pose"), ("sp-truth", "position")]
+)
+def test_other_features_are_inputs(label, state):
+    predictor = LstmPredictor(make_features(label), SAMPLES, LstmConfig(state, hidden=4))
+    network = network_of(predictor)
+    rng = np.random.default_rng(0)
+    for noise in (False, True):
+        inputs = network.draw(rng, 3, noise)
+        assert inputs["features"].shape == (3, predictor.features.num_features)
+        with torch.no_grad():
+            said = network(*map(torch.from_numpy, inputs.values()))
+        for tensor, expected in zip(said, network.imagine(inputs).values(), strict=True):
+            np.testing.assert_allclose(tensor, expected, atol=1e-5)
+
+
+def test_convolving_without_branches_gives_the_same_maps():
+    network = ImageCnn(width=4)
+    images = torch.zeros(5, 1, 128, 128)
+    images[0, 0, 33:96, 100:128] = 1
+    images[1, 0, 40:96, 30:90] = torch.rand(56, 60)
+    images[2, 0, 60:70, 5:125] = 1  # too wide for a window
+    images[4] = 1
+    with torch.no_grad():
+        wanted = convolve_windows(images, network.stack, 256)
+        torch.testing.assert_close(convolve_unbranched(images, network.stack), wanted)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"), [(1e-4, r"0\.000\d+ away .* more than 1e-05"), (np.nan, "nan away")]
+)
+def test_a_file_that_says_something_else_is_refused(command, change, message):
+    _, file, _ = command
+    other = one_shot()
+    other.mean_motion += change
+    with pytest.raises(ExportError, match=f"com_trajectory of the exported network is {message}"):
+        exporting.compare(network_of(other), file, np.random.default_rng(0))
+
+
+def test_nothing_is_overwritten_and_a_missing_library_is_named(tmp_path, monkeypatch):
+    there = tmp_path / "model.onnx"
+    there.write_text("mine")
+    with pytest.raises(ExportError, match="exists already"):
+        exporting.export_onnx(one_shot(), there)
+    monkeypatch.setattr(exporting, "LIBRARIES", ("onnx", "a_library_that_is_not_there"))
+    message = re.escape(
+        "a_library_that_is_not_there is not installed; install it with `pip install 'foretrace[onnx]'`"
+    )
+    with pytest.raises(ExportError, match=message):
+        exporting.export_onnx(one_shot(), tmp_path / "other.onnx")
+    assert there.read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["model.onnx"]
