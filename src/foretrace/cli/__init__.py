@@ -32,6 +32,7 @@ from foretrace.cli.recordings import import_recording
 from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.robot import robot
 from foretrace.cli.transfer import evaluate_transfer
+from foretrace.cli.uncertainty import evaluate_uncertainty
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -61,6 +62,7 @@ COMMANDS: dict[str, Command | Group] = {
             "replay": evaluate_replay,
             "transfer": evaluate_transfer,
             "non-flat": evaluate_non_flat,
+            "uncertainty": evaluate_uncertainty,
         },
     ),
     "figures": figures,

@@ -1,0 +1,234 @@
+"""What is measured of several futures: outcomes, errors, regions, and the rest of a motion that is under way."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foretrace.evaluation.experiments import METRICS
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.predictor import Futures, ImaginedBatch, OneShotPredictor
+from foretrace.predictor.futures import LEVELS, Mixture
+from foretrace.predictor.known import observed_values
+from foretrace.predictor.states import decode_poses, encode_states
+from foretrace.trajectories import mean_distance, rotation_error
+
+SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""Levels of the regions that tables tell of."""
+OBSERVED = (0, 10, 15, 20, 25, 30, 40)
+"""How many samples of a motion are known when the rest of it is predicted."""
+MOVED = 0.001
+"""An object moves once its centre of mass is so far from where it was at rest [m]."""
+BEGINNINGS = ("record", "moving")
+"""From where observed samples are counted: the record's start, or the first sample of an object that moves."""
+ALL = "all"
+"""The group of all interactions; others are named like their outcomes."""
+CM = 100.0
+
+Found = list[tuple[str, str, float, float]]
+"""Rows of the results: metric, group, level (NaN where there is none), value."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some interactions, as a predictor sees them."""
+
+    batch: InteractionBatch
+    features: Tensor
+    """(batch, inputs)."""
+    states: Float[np.ndarray, "batch time 6"]
+    """What happened: positions in the action frame [m], rotation vectors since rest [rad]; 0 past the end."""
+    valid: Bool[np.ndarray, "batch time"]
+    """The samples of whole records."""
+
+    @classmethod
+    def of(cls, predictor: OneShotPredictor, batch: InteractionBatch) -> "Part":
+        """As prepared for a predictor."""
+        features = predictor.compute_features(predictor.features.inputs(batch))
+        features = predictor.add_known(features, observed_values(batch, predictor.known))
+        valid = np.arange(batch.com.shape[1]) < batch.length[:, None]
+        return cls(batch, features, encode_states(batch, predictor.state, batch.length), valid)
+
+    def __len__(self) -> int:
+        return len(self.batch)
+
+    @property
+    def com(self) -> Float[np.ndarray, "batch time 3"]:
+        """Where centres of mass were [m]."""
+        return self.states[..., :3]
+
+    @property
+    def groups(self) -> dict[str, Bool[np.ndarray, " batch"]]:
+        """Members of each group: all, and those of each outcome."""
+        names = np.unique(self.batch.outcome).tolist()
+        return {ALL: np.ones(len(self), dtype=bool)} | {name: self.batch.outcome == name for name in names}
+
+    def imagine(
+        self, predictor: OneShotPredictor, rows: np.ndarray | None = None, observed: int = 0
+    ) -> ImaginedBatch:
+        """Effects of some rows (by default all) after their first samples were observed."""
+        rows = np.arange(len(self)) if rows is None else rows
+        seen = self.states[rows, :observed] if observed else None
+        return predictor.imagine_effects(self.features[rows], self.com[rows, 0], seen)
+
+    def mixture(self, predictor: OneShotPredictor) -> Mixture:
+        """What the predictor says before anything was observed."""
+        start = torch.as_tensor(self.com[:, 0], dtype=torch.float32, device=predictor.device)
+        with torch.no_grad():
+            return predictor.mixture(self.features, start)
+
+    def means(self, metric: str, values: np.ndarray, level: float = np.nan) -> Found:
+        """Rows of a metric: the mean of its values over each group, one value for each interaction."""
+        return [(metric, name, level, float(np.mean(values[mine]))) for name, mine in self.groups.items()]
+
+
+def futures_of(imagined: ImaginedBatch) -> Futures:
+    """All that may happen."""
+    assert imagined.futures is not None
+    return imagined.futures
+
+
+def judge_outcomes(said: Mapping[str, Float[np.ndarray, " batch"]], truth: np.ndarray) -> Found:
+    """Whether the most probable outcome is what happened.
+
+    Args:
+        said: Probability of each outcome.
+        truth: (batch,) names of what happened.
+
+    Returns:
+        ``confusion``: how often of two outcomes the first happened and the second was most probable. ``f1`` of each
+        outcome that happened or was said, and their mean ``macro_f1``. ``accuracy``, and that of always saying the most
+        common outcome, ``accuracy_of_most_common``. ``brier``: the squared distance of the probabilities from what
+        happened (Brier, 1950), summed over outcomes.
+    """
+    names = list(said)
+    best = np.array(names)[np.argmax(list(said.values()), axis=0)]
+    counts = {(a, b): int(np.sum((truth == a) & (best == b))) for a in names for b in names}
+    found: Found = [("confusion", f"{a}, said {b}", np.nan, float(n)) for (a, b), n in counts.items()]
+    f1 = {}
+    for name in names:
+        hits, happened, claimed = counts[name, name], np.sum(truth == name), np.sum(best == name)
+        if happened + claimed:
+            f1[name] = 2 * hits / float(happened + claimed)
+    found += [("f1", name, np.nan, value) for name, value in f1.items()]
+    brier = sum((probability - (truth == name)) ** 2 for name, probability in said.items())
+    common = max(np.mean(truth == name) for name in names)
+    overall = {"macro_f1": np.mean(list(f1.values())), "accuracy": np.mean(best == truth)}
+    overall |= {"accuracy_of_most_common": common, "brier": np.mean(brier)}
+    return found + [(metric, ALL, np.nan, float(value)) for metric, value in overall.items()]
+
+
+def judge_errors(imagined: ImaginedBatch, part: Part) -> Found:
+    """Errors of the most probable future, and of the nearest of those that count.
+
+    Returns:
+        ``full`` and ``final`` [cm], means; ``full_median``; ``until_slip_full`` and ``until_slip_final``: the same up
+        to where the object slipped; ``nearest_full`` and ``nearest_final`` [cm]: the least of all futures that count;
+        ``futures``: how many those are. ``rotation`` [degrees]: the median over interactions of the mean angle, and
+        ``final_rotation``.
+    """
+    futures = futures_of(imagined)
+    until_slip = part.valid & (np.arange(part.com.shape[1]) < part.batch.slip_index[:, None])
+    found = part.means("futures", futures.counted.sum(axis=1).astype(float))
+    for name, distance in METRICS.items():
+        truth = _known(part.com, part.valid)
+        error = CM * np.asarray(distance(imagined.com, truth))
+        slip = CM * np.asarray(distance(imagined.com, _known(part.com, until_slip)))
+        each = CM * np.asarray(distance(futures.com, np.broadcast_to(truth[:, None], futures.com.shape)))
+        nearest = np.where(futures.counted, each, np.inf).min(axis=1)
+        found += part.means(name, error) + part.means(f"until_slip_{name}", slip)
+        found += part.means(f"nearest_{name}", nearest)
+        if name == "full":
+            found += _medians(part, "full_median", error)
+    assert imagined.pose is not None
+    turned = np.degrees(rotation_error(imagined.pose[..., 3:], decode_poses(part.states)[..., 3:]))
+    found += _medians(part, "rotation", np.nanmean(np.where(part.valid, turned, np.nan), axis=1))
+    return found + _medians(part, "final_rotation", turned[np.arange(len(part)), part.batch.length - 1])
+
+
+def judge_regions(futures: Futures, part: Part) -> Found:
+    """How often whole motions stay within regions, and how wide these are.
+
+    Returns:
+        ``coverage`` at all `LEVELS`: the share of motions that never leave one of the tubes. ``tube`` [cm] at
+        `SHOWN_LEVELS`: the tube's radius about the most probable future, averaged over time; the median.
+    """
+    apart = np.linalg.norm(futures.com - part.com[:, None], axis=-1) * part.valid[:, None]
+    rows, best = np.arange(len(part)), futures.probability.argmax(axis=1)
+    found: Found = []
+    for level in LEVELS.tolist():
+        radius = futures.radius(level)  # NaN for a future that does not count: nothing is within it
+        inside = (apart <= radius).all(axis=2).any(axis=1)
+        found += part.means("coverage", inside.astype(float), level)
+        if level in SHOWN_LEVELS:
+            wide = np.where(part.valid, radius[rows, best], 0.0).sum(axis=1) / part.batch.length
+            found += _medians(part, "tube", CM * wide, level)
+    return found
+
+
+def judge_observed(predictor: OneShotPredictor, part: Part) -> Found:
+    """Errors of the rest of motions of which the first samples were observed.
+
+    Returns:
+        For both `BEGINNINGS`, with their names in front: ``rest`` [cm], the mean error of the most probable future over
+        the samples that were not observed; ``rest_unobserved``, of what was said before, over the same samples;
+        ``rest_ratio``, the first divided by the second; ``rest_count``, interactions that have a rest; ``macro_f1``.
+    """
+    unobserved = part.imagine(predictor).com
+    away = np.linalg.norm(part.com - part.com[:, :1], axis=2) * part.valid
+    moves = {"record": np.zeros(len(part), dtype=int), "moving": _first(away > MOVED)}
+    found: Found = []
+    for beginning in BEGINNINGS:
+        for level in OBSERVED:
+            known = moves[beginning] + level
+            usable = np.flatnonzero(known < part.batch.length)
+            if len(usable) == 0:
+                continue
+            given, outcomes = _given(predictor, part, usable, known[usable])
+            rest = part.valid[usable] & (np.arange(part.com.shape[1]) >= known[usable, None])
+            truth = _known(part.com[usable], rest)
+            after, before = (
+                CM * np.asarray(mean_distance(com, truth)) for com in (given, unobserved[usable])
+            )
+            for name, members in part.groups.items():
+                mine = members[usable]
+                if not mine.any():
+                    continue
+                values = {"rest": np.mean(after[mine]), "rest_unobserved": np.mean(before[mine])}
+                values |= {"rest_ratio": values["rest"] / values["rest_unobserved"], "rest_count": mine.sum()}
+                found += [(f"{beginning}_{m}", name, float(level), float(v)) for m, v in values.items()]
+            scores = judge_outcomes(outcomes, part.batch.outcome[usable])
+            found += [(f"{beginning}_{m}", g, float(level), v) for m, g, _, v in scores if m == "macro_f1"]
+    return found
+
+
+def _given(
+    predictor: OneShotPredictor, part: Part, rows: Int[np.ndarray, " n"], known: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n time 3"], dict[str, Float[np.ndarray, " n"]]]:
+    """Most probable motions [m] and probabilities of outcomes after so many samples of each were observed."""
+    com = np.empty((len(rows), *part.com.shape[1:]))
+    outcomes = {name: np.empty(len(rows)) for name in predictor.outcomes}
+    for number in np.unique(known).tolist():
+        mine = known == number
+        imagined = part.imagine(predictor, rows[mine], number)
+        com[mine] = imagined.com
+        for name, probability in futures_of(imagined).outcomes().items():
+            outcomes[name][mine] = probability
+    return com, outcomes
+
+
+def _first(true: Bool[np.ndarray, "batch time"]) -> Int[np.ndarray, " batch"]:
+    """The first sample at which something is true; past the end where it never is."""
+    return np.where(true.any(axis=1), true.argmax(axis=1), true.shape[1])
+
+
+def _known(com: Float[np.ndarray, "batch time 3"], valid: np.ndarray) -> Float[np.ndarray, "batch time 3"]:
+    """NaN where nothing is judged."""
+    return np.where(valid[..., None], com, np.nan)
+
+
+def _medians(part: Part, metric: str, values: np.ndarray, level: float = np.nan) -> Found:
+    return [(metric, name, level, float(np.median(values[mine]))) for name, mine in part.groups.items()]
