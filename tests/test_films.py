@@ -12,6 +12,7 @@ import pytest
 
 from foretrace.actions import LeverUp
 from foretrace.cli import main
+from foretrace.cli.recordings import LookedAt, look_at_photo
 from foretrace.errors import DatasetError, PerceptionError, SimulationError
 from foretrace.geometry import rotation_angle
 from foretrace.interactions import storage
@@ -226,6 +227,21 @@ def test_videos(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
     (tmp_path / "none.mp4").write_bytes(b"no video")
     with pytest.raises(PerceptionError, match="cannot be opened"):
         list(open_film(tmp_path / "none.mp4").frames())
+
+
+def test_a_photograph_of_an_object_without_height_is_refused(film: tuple[Path, FilmTruth]) -> None:
+    folder, truth = film
+    rim = truth.T_table_object[0] @ [*ACTION.contact, PRISM.height, 1.0]
+    column, row = CAMERA.project(rim[None, :3], np.linalg.inv(truth.T_table_camera))[0]
+    photo, background = folder / "colour-00000.jpg", folder / "background.png"
+
+    def look_at(height: float | None) -> LookedAt:
+        pixel = (float(column), float(row))
+        return look_at_photo(photo, None, None, height, pixel, "background", background, None, False)
+
+    assert look_at(None).sight.placed.object.height == 0.02
+    with pytest.raises(PerceptionError, match=r"object from 0\.0 to 0\.0 m high"):
+        look_at(0.0)
 
 
 def test_an_action_is_said_once() -> None:
