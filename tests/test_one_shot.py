@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from factories import fake_batch
+from foretrace.actions import sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import make_features
 from foretrace.features.outline import MAX_CORNERS, UNIT
@@ -13,6 +14,7 @@ from foretrace.features.support_points import support_points_by_rule
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
+from foretrace.objects import sample_prism
 from foretrace.predictor import OneShotConfig, OneShotPredictor, load_predictor, save_checkpoint
 from foretrace.predictor.futures import along_hinges, quantiles_of
 from foretrace.predictor.hinges import NUM_VALUES, PROBES, find_hinges, mirror_corners
@@ -227,6 +229,7 @@ def test_scores_in_any_order_give_regions_of_their_level():
 def test_observed_samples_bend_the_rest(batch):
     predictor, _ = fit_predictor(batch, LONGER, everything(batch))
     # Motions that may happen by its own account.
+    assert isinstance(predictor, OneShotPredictor)
     features = predictor.compute_features(predictor.features.inputs(batch))
     mixture = predictor.mixture(features, torch.from_numpy(batch.com[:, 0]).float())
     drawn = mixture.sample(1, torch.Generator().manual_seed(0))[:, 0].detach().double().numpy()
@@ -259,6 +262,7 @@ def test_samples_that_cannot_be_used_are_refused(batch):
 
 def test_samples_drawn_scatter_as_far_as_said(batch):
     predictor, _ = fit_predictor(batch, LONGER, everything(batch))
+    assert isinstance(predictor, OneShotPredictor)
     features = predictor.compute_features(predictor.features.inputs(batch))
     mixture = predictor.mixture(features, torch.from_numpy(batch.com[:, 0]).float())
     alone = torch.full_like(mixture.odds, -torch.inf)
@@ -276,6 +280,26 @@ def test_heights_tell_objects_of_one_outline_apart(batch):
     changed = np.abs(predictor.imagine_batch(tall).com - predictor.imagine_batch(lower).com).max(axis=(1, 2))
     assert (changed[1::2] > 1e-7).all()
     assert (changed[::2] < 1e-9).all()
+
+
+@pytest.mark.parametrize("heights", [False, True])
+def test_many_contacts_of_one_object_at_once(batch, heights):
+    config = replace(LONGER, feature_options={"heights": heights})
+    predictor, _ = fit_predictor(batch, config, everything(batch))
+    assert isinstance(predictor, OneShotPredictor)
+    rng = np.random.default_rng(5)
+    prism = sample_prism(rng, 5)
+    actions = sample_contacts(prism, rng, per_edge=2)
+    views = [TopDownView.of(prism, action) for action in actions]
+    frames = [actions[0].T_action_object @ np.linalg.inv(action.T_action_object) for action in actions]
+    contacts, directions = (np.array([frame[:2, k] for frame in frames]) for k in (3, 0))
+    many = predictor.imagine_contacts(views[0], contacts, directions)
+    one = predictor.imagine(views[0])
+    np.testing.assert_allclose(many.com[0], one.com_trajectory, atol=2e-6)
+    # Pixels hide where exactly the corners are: a millimetre.
+    others = np.array([predictor.imagine(view).com_trajectory for view in views])
+    apart = np.linalg.norm(many.com - others, axis=2).max(axis=1)
+    assert np.median(apart) < 1.5e-3
 
 
 def test_outcomes_that_are_not_learned_are_refused(batch):

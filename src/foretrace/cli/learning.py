@@ -25,12 +25,13 @@ def train(
     data: Path,
     out: Path,
     predictor: str = "lstm",
-    features: str = "im-cnn",
+    features: str | None = None,
     state: Literal["position", "pose"] = "position",
     steps_ahead: int = 1,
-    epochs: int = 15,
+    epochs: int | None = None,
     batch_size: int = 32,
-    learning_rate: float = 8e-3,
+    learning_rate: float | None = None,
+    heights: bool = False,
     known: tuple[str, ...] = (),
     outcomes: tuple[str, ...] = ("levered",),
     split: tuple[int, int, int] | None = None,
@@ -47,12 +48,16 @@ def train(
         data: Folder of the data set.
         out: Folder of the training: model, settings, metrics, split, TensorBoard events.
         predictor: Kind of predictor: lstm, or one-shot, which needs the features outline and predicts poses.
-        features: What the predictor knows about the object; an unknown label lists the choices.
+        features: What the predictor knows about the object; an unknown label lists the choices. By default im-cnn for
+            lstm, outline for one-shot.
         state: Predict the centre of mass, or the whole pose.
         steps_ahead: States predicted per iteration (n in the paper).
-        epochs: Passes over the training part; more where it is small, for 300 optimiser steps at least.
+        epochs: Passes over the training part; more where it is small, for 300 optimiser steps at least. By default 15
+            for lstm, 150 for one-shot.
         batch_size: Trajectories per optimiser step.
-        learning_rate: Adam's largest learning rate; it rises to it and falls to 0.
+        learning_rate: Adam's largest learning rate; it rises to it and falls to 0. By default 0.008 for lstm, 0.004 for
+            one-shot.
+        heights: Let the one-shot predictor see height maps, too, for objects that are not flat.
         known: Physical constants that the predictor is told beside the view: friction, tool_friction, density.
         outcomes: Outcomes of the interactions to learn from.
         split: Sizes of training, validation and test part; by default the paper's 1400 100 300, or in the same
@@ -62,30 +67,37 @@ def train(
         threads: Threads on the CPU; more than the idle cores make it slower.
         fresh: Discard the training in the folder instead of going on with it.
     """
+    from dataclasses import replace
+
     from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.record import Outcome
     from foretrace.interactions.splits import PAPER_SIZES
-    from foretrace.predictor import TrainConfig, train_predictor
+    from foretrace.predictor import RECIPES, train_predictor
 
     if unknown := [name for name in outcomes if name not in list(Outcome)]:
         raise TrainingError(f"outcome {unknown[0]!r} is unknown: choose from {', '.join(Outcome)}")
     dataset = Dataset.open(data).where(outcome=outcomes)
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
-    config = TrainConfig(
-        predictor=predictor,
-        features=features,
+    if predictor not in RECIPES:
+        raise TrainingError(f"unknown predictor {predictor!r}; available: {', '.join(RECIPES)}")
+    if heights and predictor != "one-shot":
+        raise TrainingError("--heights goes with --predictor one-shot: leave it out, or name that predictor")
+    chosen: dict[str, Any] = {"features": features, "epochs": epochs, "learning_rate": learning_rate}
+    if heights:
+        chosen["feature_options"] = {"heights": True}
+    config = replace(
+        RECIPES[predictor],
         state=state,
         steps_ahead=steps_ahead,
-        epochs=epochs,
         batch_size=batch_size,
         known=known,
         outcomes=outcomes,
         split=split,
         seed=seed,
-        learning_rate=learning_rate,
         device=device,
         threads=threads,
+        **{name: value for name, value in chosen.items() if value is not None},
     )
     try:
         train_predictor(dataset, config, out, resume=not fresh)

@@ -18,12 +18,14 @@ def evaluate_non_flat(
     out: Path,
     seeds: tuple[int, ...] = (0, 1, 2),
     splits: tuple[Literal["by-outline", "random"], ...] = ("by-outline", "random"),
+    predictor: Literal["lstm", "one-shot"] = "lstm",
+    told_heights: bool = True,
     epochs: int | None = None,
     probes: int = 60,
     threads: int = 1,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> None:
-    """Train im-cnn on masks and on height maps of objects that are not flat, and compare (paper, section 5.5).
+    """Train on masks and on height maps of objects that are not flat, and compare (paper, section 5.5).
 
     The same command goes on where an interrupted one stopped; with more seeds or splits it adds to what is there.
 
@@ -33,16 +35,21 @@ def evaluate_non_flat(
             and the trainings.
         seeds: Seeds of splits and trainings.
         splits: by-outline: objects that look alike are all in one part. random: any interaction in any part.
+        predictor: lstm: im-cnn with an LSTM, as in the paper. one-shot: the predictor of whole motions.
+        told_heights: Whether predictors are told how high the centre of mass lies at rest. That tells a box from a
+            flat prism, which a mask does not.
         epochs: Passes over the training part, as in `foretrace train`.
         probes: Lever-ups that are simulated again, nearly equal, to see how far their fates spread. 0 for none.
         threads: Threads of PyTorch.
         device: Where to compute.
     """
+    from dataclasses import replace
+
     import pandas as pd
 
     from foretrace.errors import ResultsError
     from foretrace.evaluation import non_flat_errors as experiment
-    from foretrace.predictor import TrainConfig
+    from foretrace.predictor import RECIPES
 
     if out.exists() and not out.is_dir():
         raise ResultsError(f"{out} is a file: give a folder to write to")
@@ -50,10 +57,12 @@ def evaluate_non_flat(
         raise ResultsError(f"seeds {seeds}, splits {splits}: give at least one of each, seeds from 0")
     if probes < 0:
         raise ResultsError(f"--probes is {probes}: give a number from 0")
-    config = TrainConfig(threads=threads, device=device)
+    config = replace(RECIPES[predictor], threads=threads, device=device)
+    if predictor == "one-shot":
+        config = replace(config, **experiment.ONE_SHOT)
     if epochs is not None:
-        config = TrainConfig(threads=threads, device=device, epochs=epochs)
-    found = experiment.NonFlatData.open(data)
+        config = replace(config, epochs=epochs)
+    found = experiment.NonFlatData.open(data, told_heights)
     (out / KEPT).mkdir(parents=True, exist_ok=True)
     (out / KEPT / ".gitignore").write_text("*\n", encoding="utf-8")
     tables, paths = [], pd.DataFrame()

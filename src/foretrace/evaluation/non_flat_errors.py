@@ -1,7 +1,7 @@
 """Masks against height maps of objects that are not flat (paper, section 5.5).
 
 The same predictor is trained twice on the same split: once it sees masks, once depth-enriched masks, that is, height
-maps. All outcomes are learned and judged, and whole trajectories: a cylinder that rolls away and a box that tumbles
+maps. The paper's is im-cnn with an LSTM; the predictor of whole motions can take its place. All outcomes are learned and judged, and whole trajectories: a cylinder that rolls away and a box that tumbles
 leave the blade, but that is what they do. Only a lifted object that slips off is judged up to where it slips.
 
 Objects with one outline are three of a kind: a lying cylinder, a box, a flat prism. Were one of them learned from and
@@ -24,7 +24,7 @@ from foretrace.evaluation.experiments import METRICS
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split, split_by_object, split_by_seed
 from foretrace.objects import ObjectModel, object_from_dict
-from foretrace.predictor import EffectPredictor, TrainConfig, train_predictor
+from foretrace.predictor import EffectPredictor, OneShotPredictor, TrainConfig, train_predictor
 from foretrace.predictor.states import valid_lengths, valid_samples
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.trajectories import mean_distance
@@ -37,6 +37,8 @@ SETTINGS: tuple[Setting, ...] = ("by-outline", "random")
 """How the split is drawn. ``by-outline``: no outline is in two parts; ``random``: any interaction in any part."""
 KINDS = ("cylinder", "box", "flat prism", "prism")
 """The three that share an outline, and prisms that have theirs for themselves."""
+ONE_SHOT: dict[str, Any] = {"hidden": 192, "predictor_options": {"motions": 64}}
+"""The predictor of whole motions is larger here: objects that roll and tumble move in more ways."""
 NEARLY = 0.0005
 """Two lever-ups whose contacts lie so far to either side of a third one are nearly equal to it [m]."""
 CM = 100.0
@@ -58,8 +60,13 @@ class NonFlatData:
     """Number of outline and contact together: those that look alike in the same lever-up have the same."""
 
     @classmethod
-    def open(cls, path: str | Path) -> "NonFlatData":
+    def open(cls, path: str | Path, told_heights: bool = True) -> "NonFlatData":
         """Read a data set of ``foretrace simulate --recipe mixed`` or ``solids``.
+
+        Args:
+            path: Its folder.
+            told_heights: Whether trajectories have the heights that they have. Otherwise all start at 0: from the
+                first sample, which predictors are given, nobody learns what a mask does not tell.
 
         Raises:
             DatasetError: There is none, or no two of its objects look alike.
@@ -82,9 +89,12 @@ class NonFlatData:
             )
         places = zip(*(dataset.table[name].to_pylist() for name in ("contact", "direction")), strict=True)
         rounded = [tuple(np.round([*contact, *direction], 6)) for contact, direction in places]
+        batch = dataset.batch()
+        if not told_heights:
+            batch = replace(batch, com=batch.com - batch.com[:, :1] * [0.0, 0.0, 1.0])
         return cls(
             dataset,
-            dataset.batch(),
+            batch,
             np.array([names[text] for text in texts]),
             _numbered([keys[text] for text in texts]),
             _numbered([(keys[text], place) for text, place in zip(texts, rounded, strict=True)]),
@@ -134,10 +144,11 @@ def train(
     Raises:
         TrainingError: The folder holds another training.
     """
+    one_shot = config.predictor == OneShotPredictor.label
     config = replace(
         config,
-        features="im-cnn",
-        feature_options={"channel": channel},
+        features="outline" if one_shot else "im-cnn",
+        feature_options={"heights": channel == "height"} if one_shot else {"channel": channel},
         outcomes=tuple(np.unique(data.batch.outcome).tolist()),
         split=None,
         seed=seed,

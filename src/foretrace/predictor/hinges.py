@@ -74,7 +74,7 @@ def find_hinges(
         return torch.stack([here, there], dim=1).flatten(0, 1)  # (batch views, ...)
 
     seen = _see(
-        _Hull(both(corners, mirror_corners(corners))),
+        _Hull(both(corners, _mirrored(corners, hull.count))),
         both(edges, images),
         both(com, com * mirror),
         both(lift, lift * mirror[:2]),
@@ -89,9 +89,12 @@ def find_hinges(
 
 def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "batch corners 2"]:
     """The hulls of `find_hinges` seen in a mirror along the action axis, counter-clockwise again."""
+    return _mirrored(corners, _Hull(corners).count)
+
+
+def _mirrored(corners: Tensor, count: Int[Tensor, " batch"]) -> Tensor:
     number = torch.arange(corners.shape[1], device=corners.device)
-    count = _Hull(corners).count[:, None]
-    order = torch.where(number < count, -number % count, 0)
+    order = torch.where(number < count[:, None], -number % count[:, None], 0)
     return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor(MIRROR[:2])
 
 

@@ -1,5 +1,6 @@
 """A predictor that says whole motions at once, what may happen instead, and how sure it is."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,7 +16,8 @@ from foretrace.features import FeatureExtractor, Outline
 from foretrace.features.outline import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Outcome
-from foretrace.predictor.base import EffectPredictor, ImaginedBatch
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
+from foretrace.predictor.base import EffectPredictor, ImaginedBatch, estimate_com
 from foretrace.predictor.futures import (
     COORDINATES,
     LEVELS,
@@ -28,6 +30,7 @@ from foretrace.predictor.futures import (
     quantiles_of,
 )
 from foretrace.predictor.hinges import NUM_VALUES, PROBES, Hinges, find_hinges
+from foretrace.predictor.known import given_values
 from foretrace.predictor.states import Effects, decode_poses
 
 ODD = (1, 3, 5)
@@ -306,6 +309,49 @@ class OneShotPredictor(EffectPredictor):
             self.times.cpu().numpy(), futures.com[rows, best], futures.pose[rows, best], futures
         )
 
+    def imagine_contacts(
+        self,
+        view: TopDownView,
+        contacts: Float[np.ndarray, "n 2"],
+        directions: Float[np.ndarray, "n 2"],
+        com: Float[np.ndarray, "3"] | None = None,
+        known: Mapping[str, float] | None = None,
+    ) -> ImaginedBatch:
+        """Imagine lever-ups of one object at many contacts from a single view, whose outline is fitted once.
+
+        Args:
+            view: The object, in any action frame.
+            contacts: Contact points in that frame [m].
+            directions: Unit vectors along which the blade is pushed there.
+            com: Centre of mass at rest in that frame [m]; estimated from the view if not given.
+            known: As of `imagine`.
+
+        Returns:
+            One row per contact, each in the frame of its own action.
+
+        Raises:
+            PredictionError: A known value is missing or of no use.
+        """
+        batch = InteractionBatch.from_views([view])
+        start = estimate_com(batch)[0] if com is None else np.asarray(com, dtype=float)
+        turned = np.stack(
+            [directions, directions[:, ::-1] * [-1, 1]], axis=1
+        )  # rows: x and y of the new frames
+        values = np.repeat(given_values(known, self.known), len(contacts), axis=0)
+        starts = np.concatenate(
+            [np.einsum("nij,nj->ni", turned, start[:2] - contacts), np.full((len(contacts), 1), start[2])],
+            axis=1,
+        )
+        seen = self.features.inputs(batch).to(self.device)
+        axes, origins = (torch.from_numpy(a).to(seen) for a in (turned, contacts))
+        corners = seen[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2)) - origins[:, None] / UNIT
+        features = (corners @ axes.mT).flatten(1)
+        if self.heights:
+            cells = seen[:, 2 * MAX_CORNERS :].unflatten(1, (1, HEIGHT_CELLS, HEIGHT_CELLS))
+            moved = _moved_maps(cells.expand(len(contacts), -1, -1, -1), axes, origins)
+            features = torch.cat([features, moved.flatten(1)], dim=1)
+        return self.imagine_effects(self.add_known(features, values), starts)
+
     # --- what the networks say ----------------------------------------------------------------------------
 
     def _see(self, features: Float[Tensor, "batch inputs"], com: Float[Tensor, "batch 3"]) -> Hinges:
@@ -411,3 +457,17 @@ class OneShotPredictor(EffectPredictor):
         time = torch.arange(effects.states.shape[1], device=self.device)
         held = time.expand(len(effects), -1).minimum(effects.lengths[:, None] - 1)
         return effects.states.gather(1, held[..., None].expand_as(effects.states))
+
+
+def _moved_maps(
+    maps: Float[Tensor, "n 1 rows columns"], axes: Float[Tensor, "n 2 2"], origins: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n rows columns"]:
+    """Maps over a whole view as seen from other frames, of which the axes and origins in the view's are given [m]."""
+    cell = VIEW_SIZE / maps.shape[-1]
+    middle = (torch.arange(maps.shape[-1]).to(maps) + 0.5) * cell - 0.5
+    pixels = torch.stack(torch.meshgrid(middle, middle, indexing="ij"), dim=-1).flatten(0, 1)
+    contact = maps.new_tensor(CONTACT_PIXEL)
+    points = (contact - pixels) * METRES_PER_PIXEL @ axes + origins[:, None]
+    places = ((2 * (contact - points / METRES_PER_PIXEL) + 1) / VIEW_SIZE - 1).flip(-1)
+    found = F.grid_sample(maps, places.unflatten(1, maps.shape[-2:]), align_corners=False)
+    return found[:, 0]

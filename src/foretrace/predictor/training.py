@@ -23,6 +23,7 @@ from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import PREDICTORS, load_tensors, read_tensors, settings_of
 from foretrace.predictor.display import tensorboard, terminal
+from foretrace.predictor.domain import ranges_of
 from foretrace.predictor.files import write_tensors
 from foretrace.predictor.known import check_names, observed_values
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
@@ -125,7 +126,7 @@ class TrainConfig:
 RECIPES = {
     "lstm": TrainConfig(),
     "one-shot": TrainConfig(
-        predictor="one-shot", features="outline", hidden=128, epochs=100, learning_rate=4e-3
+        predictor="one-shot", features="outline", hidden=128, epochs=150, learning_rate=4e-3
     ),
 }
 """What a kind of predictor is trained with, unless somebody asks for something else; keys are those of PREDICTORS."""
@@ -239,7 +240,7 @@ def train_predictor(
                 show(row, done)
 
             _Training(config, predictor, folder, train, validation).run(report, tell)
-    folder.close()
+    folder.close(predictor)
     return folder.path
 
 
@@ -315,6 +316,8 @@ class _Training:
                     *(self._features_of(self.validation), self._effects_of(self.validation)),
                 )
             self.keeper.finish(self.predictor)
+        batch, inputs = self.train.batch, self.train.inputs
+        self.predictor.ranges = ranges_of(self.predictor.measure(batch, batch.com[:, 0], inputs))
         return done
 
     def _fit_features(self, report: Callable[[str], None]) -> None:
