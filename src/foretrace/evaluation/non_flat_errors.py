@@ -1,8 +1,9 @@
 """Masks against height maps of objects that are not flat (paper, section 5.5).
 
 The same predictor is trained twice on the same split: once it sees masks, once depth-enriched masks, that is, height
-maps. The paper's is im-cnn with an LSTM; the predictor of whole motions can take its place. All outcomes are learned and judged, and whole trajectories: a cylinder that rolls away and a box that tumbles
-leave the blade, but that is what they do. Only a lifted object that slips off is judged up to where it slips.
+maps. The paper's is im-cnn with an LSTM; the predictor of whole motions can take its place. All outcomes are learned
+and judged, and whole trajectories: a cylinder that rolls away and a box that tumbles leave the blade, but that is what
+they do. Only a lifted object that slips off is judged up to where it slips.
 
 Objects with one outline are three of a kind: a lying cylinder, a box, a flat prism. Were one of them learned from and
 another one tested, a mask would tell which outline it is, so the split that counts keeps them together.
