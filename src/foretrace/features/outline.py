@@ -82,6 +82,12 @@ class Outline(FeatureExtractor):
         return inputs
 
 
+def count_corners(features: Float[Tensor, "batch features"]) -> Int[Tensor, " batch"]:
+    """How many corners the hulls have that ``outline`` tells of."""
+    corners = features[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2))
+    return 1 + (corners[:, 1:] != corners[:, :1]).any(dim=2).sum(dim=1)
+
+
 def fit_hull(mask: Bool[np.ndarray, "128 128"]) -> Float[np.ndarray, "n 2"]:
     """Corners of the largest object's convex hull, counter-clockwise in the action frame [m].
 

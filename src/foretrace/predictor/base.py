@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -12,10 +12,12 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 from foretrace.errors import PredictionError, TrainingError
-from foretrace.features import FeatureExtractor, Precision
+from foretrace.features import FeatureExtractor, Outline, Precision
+from foretrace.features.outline import count_corners
 from foretrace.geometry import continuous_rotation_vectors, quaternion_to_matrix
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, TopDownView
+from foretrace.predictor.domain import Ranges, check_view, find_unusual, measure
 from foretrace.predictor.futures import Futures
 from foretrace.predictor.known import check_names, given_values, observed_values
 from foretrace.predictor.states import (
@@ -49,6 +51,8 @@ class ImaginedEffect:
     futures: Futures | None = None
     """All that may happen, one row; the trajectories above are those of the most probable. None if the predictor
     tells of one future only."""
+    warnings: tuple[str, ...] = ()
+    """In what the object is unlike those that the predictor has learned from, as far as it knows."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,8 @@ class ImaginedBatch:
     """As ``ImaginedEffect.pose_trajectory``, one per interaction."""
     futures: Futures | None = None
     """As ``ImaginedEffect.futures``, one row per interaction."""
+    warnings: tuple[tuple[str, ...], ...] = ()
+    """As ``ImaginedEffect.warnings``, one per interaction; or none at all, where nobody looked."""
 
     def __len__(self) -> int:
         return len(self.com)
@@ -70,7 +76,8 @@ class ImaginedBatch:
     def __getitem__(self, index: int) -> ImaginedEffect:
         pose = None if self.pose is None else self.pose[index]
         futures = None if self.futures is None else self.futures[np.array([index])]
-        return ImaginedEffect(self.times, self.com[index], pose, futures)
+        warnings = self.warnings[index] if self.warnings else ()
+        return ImaginedEffect(self.times, self.com[index], pose, futures, warnings)
 
 
 class EffectPredictor(nn.Module, ABC):
@@ -108,6 +115,8 @@ class EffectPredictor(nn.Module, ABC):
         self.features = features
         self.outcomes = tuple(outcomes)
         self.state: StateKind = state
+        self.ranges: Ranges = {}
+        """Between which values the training part lies, by the names of `domain.MEASURES`; empty if not known."""
         self.register_buffer("state_mean", torch.zeros(state_size(state)))
         self.register_buffer("state_scale", torch.ones(state_size(state)))
         self.register_buffer("times", torch.zeros(num_samples, dtype=torch.float64))
@@ -249,23 +258,30 @@ class EffectPredictor(nn.Module, ABC):
                 already: rows as of ``ImaginedEffect.pose_trajectory``. The first one is at rest.
 
         Raises:
-            PredictionError: The predictor's features are only known after the action; or a known value is missing,
-                is not finite, or is none that the predictor knows; or the predictor makes no use of samples, or
-                they are too many.
+            PredictionError: The view does not show one object that is levered at its rim, see `check_view`; or the
+                predictor's features are only known after the action; or a known value is missing, is not finite, or
+                is none that the predictor knows; or the predictor makes no use of samples, or they are too many.
         """
         if self.features.oracle:
             raise PredictionError(
                 f"features {self.features.label!r} are observed during the action and cannot be had from "
                 "a view: use a predictor with other features"
             )
+        check_view(view)
         batch = InteractionBatch.from_views([view])
         seen = None if observed is None else self._check_observed(np.asarray(observed, dtype=float))
         if com is None:
             com = estimate_com(batch)[0] if seen is None else seen[0, :3]
+        start = np.asarray(com, dtype=float)[None]
+        if not np.isfinite(start).all():
+            raise PredictionError(f"com is {start[0]}: give a finite centre of mass [m], or none")
         values = given_values(known, self.known)
-        features = self.add_known(self.compute_features(self.features.inputs(batch)), values)
+        inputs = self.features.inputs(batch)
+        warnings = self._find_unusual(batch, start, inputs)
+        features = self.compute_features(inputs)
         seen = None if seen is None else seen[None]
-        return self.imagine_effects(features, np.asarray(com, dtype=float)[None], seen)[0]
+        imagined = self.imagine_effects(self.add_known(features, values), start, seen)
+        return replace(imagined, warnings=warnings)[0]
 
     def imagine_batch(
         self, batch: InteractionBatch, start: Start = "observed", observed: int = 0
@@ -283,8 +299,9 @@ class EffectPredictor(nn.Module, ABC):
                 observed samples, or they are too many.
         """
         com = batch.com[:, 0] if start == "observed" else estimate_com(batch)
-        features = self.compute_features(self.features.inputs(batch))
-        features = self.add_known(features, observed_values(batch, self.known))
+        inputs = self.features.inputs(batch)
+        warnings = self._find_unusual(batch, com, inputs)
+        features = self.add_known(self.compute_features(inputs), observed_values(batch, self.known))
         seen = None
         if observed:
             unturned = np.broadcast_to([0.0, 0, 0, 1, 0, 0, 0], (observed, 7))
@@ -295,7 +312,25 @@ class EffectPredictor(nn.Module, ABC):
                     f"{observed} to be observed: leave it out or observe fewer"
                 )
             seen = encode_states(batch, self.state, batch.length)[:, :observed]
-        return self.imagine_effects(features, com, seen)
+        return replace(self.imagine_effects(features, com, seen), warnings=warnings)
+
+    def measure(
+        self,
+        batch: InteractionBatch,
+        com: Float[np.ndarray, "batch 3"],
+        inputs: Shaped[Tensor, "batch ..."],
+    ) -> dict[str, Float[np.ndarray, " batch"]]:
+        """What objects are compared by with those learned from, see `domain.measure`.
+
+        ``inputs`` are those of the features.
+        """
+        corners = count_corners(inputs).cpu().numpy() if isinstance(self.features, Outline) else None
+        return measure(batch, com, corners)
+
+    def _find_unusual(
+        self, batch: InteractionBatch, com: np.ndarray, inputs: Tensor
+    ) -> tuple[tuple[str, ...], ...]:
+        return find_unusual(self.measure(batch, com, inputs), self.ranges) if self.ranges else ()
 
     def imagine_effects(
         self,

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from foretrace.errors import CheckpointError, TrainingError
 from foretrace.features import make_features
 from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.domain import read_ranges
 from foretrace.predictor.files import write_json, write_tensors
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
@@ -22,6 +23,8 @@ FORMAT = "foretrace-predictor"
 FORMAT_VERSION = 1
 CONFIG = "config.json"
 MODEL = "model.safetensors"
+RANGES = "ranges"
+"""Entry of ``config.json`` that is there only once the training is finished."""
 PREDICTORS: dict[str, tuple[Callable[..., EffectPredictor], type[LstmConfig] | type[OneShotConfig]]] = {
     LstmPredictor.label: (LstmPredictor, LstmConfig),
     OneShotPredictor.label: (OneShotPredictor, OneShotConfig),
@@ -44,7 +47,8 @@ def settings_of(config: Any) -> dict[str, Any]:
 
 
 def describe(predictor: EffectPredictor) -> dict[str, Any]:
-    """What ``config.json`` must say for the predictor to be made again."""
+    """What ``config.json`` must say for the predictor to be made again, and what it knows of its training part."""
+    ranges = {RANGES: predictor.ranges} if predictor.ranges else {}
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -52,7 +56,7 @@ def describe(predictor: EffectPredictor) -> dict[str, Any]:
         "settings": settings_of(predictor.config),
         "features": {"label": predictor.features.label, "options": predictor.features.options},
         "num_samples": predictor.num_samples,
-    }
+    } | ranges
 
 
 def save_checkpoint(
@@ -168,8 +172,10 @@ def _make(config: Mapping[str, Any], file: Path) -> EffectPredictor:
             raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
         extractor = make_features(features["label"], **features["options"])
         tuples = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
-        return kind(extractor, num_samples, settings_kind(**settings | tuples))
+        predictor = kind(extractor, num_samples, settings_kind(**settings | tuples))
+        predictor.ranges = read_ranges(config.get(RANGES))
+        return predictor
     except TrainingError as error:
         raise CheckpointError(f"{file}: {error}") from error
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{file} is incomplete ({error!r}): copy it again or train anew") from error

@@ -21,7 +21,15 @@ from foretrace.errors import TrainingError
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.checkpoint import CONFIG, MODEL, describe, load_tensors, read_config, read_tensors
+from foretrace.predictor.checkpoint import (
+    CONFIG,
+    MODEL,
+    RANGES,
+    describe,
+    load_tensors,
+    read_config,
+    read_tensors,
+)
 from foretrace.predictor.files import write_json, write_tensors, write_text
 
 ENVIRONMENT = "environment.json"
@@ -101,7 +109,8 @@ class RunFolder:
         write_json(self.path / CONFIG, config)
 
     def _check(self, config: Mapping[str, Any]) -> None:
-        found, wanted = flatten(read_config(self.path)), flatten(config)
+        there = {name: value for name, value in read_config(self.path).items() if name != RANGES}
+        found, wanted = flatten(there), flatten(config)
         for name in sorted(found.keys() | wanted.keys()):
             if found.get(name) != wanted.get(name):
                 raise TrainingError(
@@ -173,8 +182,9 @@ class RunFolder:
         """Keep the finished predictor in place of the best model."""
         write_tensors(self.path / MODEL, predictor.state_dict())
 
-    def close(self) -> None:
-        """Declare the training finished."""
+    def close(self, predictor: EffectPredictor) -> None:
+        """Note between which values the training part lies, and declare the training finished."""
+        write_json(self.path / CONFIG, read_config(self.path) | {RANGES: dict(predictor.ranges)})
         (self.path / RESUME).unlink(missing_ok=True)
 
 
