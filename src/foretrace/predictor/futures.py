@@ -15,6 +15,8 @@ FLOOR = 1e-4
 """Nobody is surer of a position than this [m]: what half the time step changes in simulation is a fifth of it."""
 NOISE = 5e-4
 """What an observed position may be off [m]; also what principal motions leave out."""
+FREEDOM = 4.0
+"""Degrees of freedom of the Student distribution of errors: the fewer, the heavier its tails."""
 COORDINATES = 6
 """A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
 TURN_LENGTH = 0.05
@@ -126,30 +128,39 @@ class Mixture:
     def given(self, observed: Float[Tensor, "batch samples 6"]) -> "Mixture":
         """The mixture after the first samples were observed, by Bayes' rule.
 
+        Conditional multivariate Student distributions (Roth, 2013, "On the multivariate t distribution"). Regions that
+        were measured before anything was observed hold only roughly for what is given here.
+
         Args:
             observed: Positions in the action frame [m] and rotation vectors since rest [rad].
         """
         k = observed.shape[1]
         motion = torch.cat([observed[..., :3] - self.com[:, None], TURN_LENGTH * observed[..., 3:]], dim=-1)
         seen = along_hinges(self.axes, motion)  # (batch, hinges, samples, 6)
-        basis = self.motions[:, :k].flatten(1)
-        off = (seen - self.mean_motion[:k]).flatten(2)[:, :, None] - self.mean @ basis
-        # Of standard-normal weights z, of which the motion is a linear image.
-        image = self.factor.mT @ basis / NOISE
+        # What is known exactly and what is hardly known lie orders of magnitude apart: too many for float32.
+        basis, factor = self.motions[:, :k].flatten(1).double(), self.factor.double()
+        off = (seen - self.mean_motion[:k]).double().flatten(2)[:, :, None] - self.mean.double() @ basis
+        # Of unit weights z, of which the motion is a linear image.
+        image = factor.mT @ basis / NOISE
         off = off[..., None] / NOISE
         precision = image @ image.mT + torch.eye(image.shape[-2], dtype=image.dtype, device=image.device)
         root = torch.linalg.cholesky(precision)
         pull = image @ off
         z = torch.cholesky_solve(pull, root)
-        evidence = (pull * z).sum(dim=(-2, -1)) - off.square().sum(dim=(-2, -1))
-        evidence = evidence / 2 - root.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
-        odds = (self.odds + evidence).flatten(1).log_softmax(dim=1).view_as(self.odds)
-        mean = self.mean + (self.factor @ z)[..., 0]
-        inverse = torch.linalg.solve_triangular(
-            root, torch.eye(len(basis)).to(root).expand_as(root), upper=False
-        )
+        # A Student distribution in place of the normal one: an odd beginning makes what follows less sure, not another
+        # future certain. It has as many dimensions as samples tell weights apart from noise.
+        size = len(basis) - torch.cholesky_inverse(root).diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+        distance = off.square().sum(dim=(-2, -1)) - (pull * z).sum(dim=(-2, -1))
+        heavy = (FREEDOM + size) / 2 * torch.log1p(distance / FREEDOM)
+        evidence = -heavy - root.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        wider = ((FREEDOM + distance) / (FREEDOM + size)).sqrt()
+        odds = (self.odds + evidence.to(self.odds)).flatten(1).log_softmax(dim=1).view_as(self.odds)
+        mean = self.mean + (factor @ z)[..., 0].to(self.mean)
+        unit = torch.eye(len(basis), dtype=root.dtype, device=root.device).expand_as(root)
+        inverse = torch.linalg.solve_triangular(root, unit, upper=False) * wider[..., None, None]
         # (factor inverse^T) (factor inverse^T)^T is the covariance; any square root of it will do.
-        return replace(self, odds=odds, mean=mean, factor=self.factor @ inverse.mT, observed=observed)
+        spread = (factor @ inverse.mT).to(self.factor)
+        return replace(self, odds=odds, mean=mean, factor=spread, observed=observed)
 
     def most_probable(self) -> Float[Tensor, "batch time 6"]:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
@@ -169,7 +180,7 @@ class Mixture:
         """Positions [m] and rotation vectors [rad] drawn at random."""
         rows = torch.arange(len(self.com), device=self.com.device)[:, None]
         chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
-        z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator)
+        z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
         factor = self.factor.flatten(1, 2)[rows, chosen]
         weights = self.mean.flatten(1, 2)[rows, chosen] + (factor @ z[..., None].to(factor))[..., 0]
         return self._states(weights, self.axes[rows, chosen // self.odds.shape[2]])
