@@ -302,6 +302,17 @@ def test_many_contacts_of_one_object_at_once(batch, heights):
     assert np.median(apart) < 1.5e-3
 
 
+def test_an_unknown_thickness_is_not_blown_up(batch):
+    predictor, _ = fit_predictor(batch, LONGER, everything(batch))
+    assert np.ptp(batch.com[:, 0, 2]) < 1e-3  # all are of one thickness
+    view = TopDownView(batch.mask[0], batch.height[0])
+    ends = [
+        predictor.imagine(view, com).com_trajectory[-1] - com
+        for com in batch.com[0, 0] * [[1, 1, 1], [1, 1, 2]]
+    ]
+    assert np.linalg.norm(ends[0] - ends[1]) < 5e-3
+
+
 def test_outcomes_that_are_not_learned_are_refused(batch):
     with pytest.raises(TrainingError, match="outcome 'slipped', and the predictor is to learn levered"):
         fit_predictor(batch, replace(QUICK, outcomes=("levered",)), everything(batch))

@@ -41,6 +41,8 @@ TEMPERATURE = 0.003
 """Of two futures, one that is this much nearer to what happened [m] counts e times as much in training."""
 SURENESS_WEIGHT = 0.02
 """Weight of the error of the expected error in the loss."""
+SAME = 0.01
+"""A number seen from hinges that varies by less (a millimetre, half a degree) counts as the same everywhere."""
 FEW = 10
 """So many lever-ups with an outcome tell how much they scatter."""
 SAMPLES_PER_STEP = 15
@@ -195,7 +197,9 @@ class OneShotPredictor(EffectPredictor):
         hinges = self._see(features, self._com(effects.states))
         values = hinges.values.flatten(0, 2)
         self.value_mean.copy_(values.mean(dim=0))
-        self.value_scale.copy_(values.std(dim=0, correction=0).clamp(min=1e-3))
+        scale = values.std(dim=0, correction=0)
+        # What is nearly the same everywhere tells nothing apart, and must not blow up where it is not: it is shifted.
+        self.value_scale.copy_(torch.where(scale < SAME, 1.0, scale))
         moved = along_hinges(hinges.axes[:, 0, 0], self._motion(self._held(effects)))  # (batch, time, 6)
         odd = torch.isin(torch.arange(COORDINATES), torch.tensor(ODD)).to(moved)
         self.mean_motion.copy_(moved.mean(dim=0) * (1 - odd))
