@@ -32,6 +32,8 @@ def train(
     batch_size: int = 32,
     learning_rate: float | None = None,
     heights: bool = False,
+    hidden: int | None = None,
+    motions: int = 32,
     known: tuple[str, ...] = (),
     outcomes: tuple[str, ...] = ("levered",),
     split: tuple[int, int, int] | None = None,
@@ -58,6 +60,8 @@ def train(
         learning_rate: Adam's largest learning rate; it rises to it and falls to 0. By default 0.008 for lstm, 0.004 for
             one-shot.
         heights: Let the one-shot predictor see height maps, too, for objects that are not flat.
+        hidden: Units of the LSTM, by default 256; or of each layer of the one-shot predictor, by default 128.
+        motions: Principal motions that the one-shot predictor puts trajectories together from.
         known: Physical constants that the predictor is told beside the view: friction, tool_friction, density.
         outcomes: Outcomes of the interactions to learn from.
         split: Sizes of training, validation and test part; by default the paper's 1400 100 300, or in the same
@@ -84,6 +88,9 @@ def train(
     if heights and predictor != "one-shot":
         raise TrainingError("--heights goes with --predictor one-shot: leave it out, or name that predictor")
     chosen: dict[str, Any] = {"features": features, "epochs": epochs, "learning_rate": learning_rate}
+    chosen["hidden"] = hidden
+    if motions != 32:
+        chosen["predictor_options"] = {"motions": motions}
     if heights:
         chosen["feature_options"] = {"heights": True}
     config = replace(
