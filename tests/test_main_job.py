@@ -185,6 +185,11 @@ def test_the_built_wheel_holds_everything(tmp_path: Path) -> None:
         "p = ft.Prism([[0, 0], [.1, 0], [.1, .1], [0, .1]]); a = ft.LeverUp.at_edge(p, 0);"
         "print(ft.simulate(p, a, embodiment='tool').effect.outcome)"
     )
+    if (ROOT / "src/foretrace/predictor/default").is_dir():
+        shipped = (
+            "v = ft.TopDownView.of(p, a); assert ft.load_predictor().imagine(v).com_trajectory.shape[1] == 3;"
+        )
+        program = program.replace("print(ft.simulate", f"{shipped}print(ft.simulate")
     python = environment / "bin" / "python"
     done = subprocess.run([python, "-c", program], check=True, capture_output=True, text=True, cwd=tmp_path)
     assert str(packages) in done.stdout

@@ -16,6 +16,7 @@ import tyro
 import foretrace
 from foretrace.cli.calibrate import calibrate
 from foretrace.cli.capture import capture
+from foretrace.cli.card import card
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
@@ -65,6 +66,7 @@ COMMANDS: dict[str, Command | Group] = {
             "uncertainty": evaluate_uncertainty,
         },
     ),
+    "card": card,
     "figures": figures,
     "predict": predict,
     "export": Group(

@@ -84,11 +84,11 @@ def export_lerobot(
     print(out)
 
 
-def export_onnx(run: Positional[Path], out: Path = Path("model.onnx")) -> None:
+def export_onnx(run: Positional[Path | None] = None, out: Path = Path("model.onnx")) -> None:
     """Write a predictor's network as an ONNX file, and compare it with PyTorch. Needs foretrace[onnx].
 
     Args:
-        run: Folder of the training.
+        run: Folder of the training; by default the predictor that comes with foretrace.
         out: File to write.
     """
     from foretrace.export.onnx import export_onnx

@@ -115,7 +115,7 @@ def train(
 
 
 def predict(
-    run: Positional[Path],
+    run: Positional[Path | None] = None,
     polygon: Path | None = None,
     image: Path | None = None,
     scale: float | None = None,
@@ -145,7 +145,7 @@ def predict(
     table and --contact-px.
 
     Args:
-        run: Folder of the training.
+        run: Folder of the training; by default the predictor that comes with foretrace.
         polygon: File with the outline's corners, one "x y" or "x,y" per line [m].
         image: Picture of the object's silhouette, white on black; needs --scale.
         scale: Metres per pixel of the image, or per unit of the mesh (1 by default).
@@ -172,6 +172,7 @@ def predict(
     """
     from dataclasses import replace
 
+    from foretrace.cli.futures import outlook_of, radius_of, say_futures
     from foretrace.evaluation.animation import scene_animation
     from foretrace.evaluation.figures import Scene, scene_figure
     from foretrace.interactions.record import Physics
@@ -212,11 +213,13 @@ def predict(
         scene = replace(Scene.observed(truth, paths), title=title)
     else:
         scene = Scene.imagined(obj, action, imagined.times, paths)
+    scene = replace(scene, outlook=outlook_of(imagined))
+    say_futures(imagined)
     out.mkdir(parents=True, exist_ok=True)
     _write_trajectory(out, run, obj, action, imagined, truth)
     scene_figure(scene).savefig(out / "prediction.png")
     if seen is not None:
-        seen.save_overlay(out / "overlay.png", imagined.com_trajectory)
+        seen.save_overlay(out / "overlay.png", imagined.com_trajectory, radius_of(imagined))
     if animation:
         scene_animation(scene, out / "prediction.gif")
     if truth is not None:
@@ -302,14 +305,16 @@ def _object_and_action(
     return obj, action, TopDownView.of(obj, action), com
 
 
-def _write_trajectory(out: Path, run: Path, obj: Any, action: Any, imagined: Any, truth: Any) -> None:
+def _write_trajectory(out: Path, run: Path | None, obj: Any, action: Any, imagined: Any, truth: Any) -> None:
     import json
 
     import numpy as np
     import pandas as pd
 
+    from foretrace.cli.futures import futures_content
+
     content = {
-        "predictor": str(run),
+        "predictor": "default" if run is None else str(run),
         "frame": "action: origin at the contact point on the table top, x along the action, y left, z up",
         "units": {"times": "s", "com_trajectory": "m"},
         "object": obj.to_dict(),
@@ -320,6 +325,7 @@ def _write_trajectory(out: Path, run: Path, obj: Any, action: Any, imagined: Any
     }
     if imagined.pose_trajectory is not None:
         content["pose_trajectory"] = imagined.pose_trajectory.tolist()
+    content |= futures_content(imagined)
     if truth is not None:
         content["simulated"] = {
             "outcome": str(truth.effect.outcome),

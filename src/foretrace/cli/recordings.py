@@ -150,8 +150,8 @@ class LookedAt:
     T_table_camera: "np.ndarray"
     """Its pose."""
 
-    def save_overlay(self, path: Path, predicted: "np.ndarray") -> None:
-        """Draw the outline and a path in the action frame [m] onto the photograph."""
+    def save_overlay(self, path: Path, predicted: "np.ndarray", radius: "np.ndarray | None" = None) -> None:
+        """Draw the outline, a path in the action frame [m] and how far off it may be [m] onto the photograph."""
         import cv2
 
         from foretrace.geometry import transform_points
@@ -160,7 +160,9 @@ class LookedAt:
         in_table = transform_points(self.sight.T_table_action, predicted)
         outline = self.sight.placed.outline(self.sight.placed.object.height)
         paths = {"predicted": (in_table, PREDICTED)}
-        cv2.imwrite(str(path), draw_overlay(self.picture, self.camera, self.T_table_camera, outline, paths))
+        radii = None if radius is None else {"predicted": radius}
+        scene = self.picture, self.camera, self.T_table_camera, outline, paths
+        cv2.imwrite(str(path), draw_overlay(*scene, radii=radii))
 
 
 def look_at_photo(

@@ -5,7 +5,7 @@ The colours are Okabe and Ito's, which colour-blind readers can tell apart; line
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -15,9 +15,11 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, PredictionError
+from foretrace.evaluation.tubes import Outlook
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
@@ -101,6 +103,8 @@ class Scene:
     """First sample off the blade."""
     title: str = ""
     """What it is, in a line."""
+    outlook: Outlook = field(default_factory=Outlook)
+    """What else may happen; drawn in the colour of the first prediction."""
 
     @classmethod
     def observed(
@@ -209,15 +213,16 @@ def scene_figure(scene: Scene) -> Figure:
     return fig
 
 
-def legend_of(scene: Scene) -> list[Line2D]:
+def legend_of(scene: Scene) -> list[Line2D | Patch]:
     """Legend entries of a scene; predictions carry their error where the truth is known."""
-    handles = []
+    handles: list[Line2D | Patch] = []
     for name, path, color, style, width in scene.paths():
         label = f"centre of mass, {name}"
         if scene.com is not None and path is not scene.com:
             mean, final = _errors(scene, path)
             label += f" (mean error {mean:.2f} cm, at the end {final:.2f} cm)"
         handles.append(Line2D([], [], color=color, linestyle=style, linewidth=width, label=label))
+    handles += scene.outlook.handles(PREDICTION_COLORS[0])
     if scene.support_points is not None:
         handles.append(_support_handle())
     return handles
@@ -240,6 +245,7 @@ def draw_from_above(ax: Axes, scene: Scene, margin: float = 0.025) -> None:
         ax.plot(path[:, 1] * CM, path[:, 0] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
         ax.plot(path[-1, 1] * CM, path[-1, 0] * CM, color=color, marker="o", markersize=4.5, zorder=5)
     paths = [path[:, :2] for _, path, *_ in scene.paths()]
+    paths.append(scene.outlook.draw_in_plane(ax, [1, 0], PREDICTION_COLORS[0])[:, ::-1])
     seen = np.concatenate([scene.outline, [[-ARROW_LENGTH, 0]], *paths])
     low, high = (seen.min(axis=0) - margin) * CM, (seen.max(axis=0) + margin) * CM
     ax.set(xlim=(high[1], low[1]), ylim=(low[0], high[0]), aspect="equal", title="From above")
@@ -262,6 +268,7 @@ def draw_from_the_side(ax: Axes, scene: Scene, instants: int = 5) -> None:
     for _, path, color, style, width in scene.paths():
         ax.plot(path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
         ax.plot(path[-1, 0] * CM, path[-1, 2] * CM, color=color, marker="o", markersize=4.5, zorder=5)
+    scene.outlook.draw_in_plane(ax, [0, 2], PREDICTION_COLORS[0])
     (left, right), top = ax.get_xlim(), max(ax.get_ylim()[1], 6.0)
     ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
     ax.axhspan(-50, 0, color="#f1f2f4", zorder=-1)
@@ -278,6 +285,7 @@ def draw_over_time(axes: list[Axes], scene: Scene) -> None:
     for k, (ax, name) in enumerate(zip(axes, ("x", "y", "z"), strict=True)):
         for _, path, color, style, width in scene.paths():
             ax.plot(scene.times_of(path), path[:, k] * CM, color=color, linestyle=style, linewidth=width)
+        scene.outlook.draw_over_time(ax, scene.times_of(scene.outlook.path), k, PREDICTION_COLORS[0])
         if scene.slip_index is not None and scene.slip_index < len(scene.times):
             ax.axvline(scene.times[scene.slip_index], color=GREY, linestyle=":", linewidth=1.2)
             if k == 0:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ FORMAT = "foretrace-predictor"
 FORMAT_VERSION = 1
 CONFIG = "config.json"
 MODEL = "model.safetensors"
+DEFAULT = "default"
+"""Folder of the predictor that comes with the package."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
 PREDICTORS: dict[str, tuple[Callable[..., EffectPredictor], type[LstmConfig] | type[OneShotConfig]]] = {
@@ -75,13 +78,30 @@ def save_checkpoint(
     write_json(directory / CONFIG, describe(predictor) | {"training": dict(training or {})})
 
 
-def load_predictor(path: str | Path) -> EffectPredictor:
+def default_checkpoint() -> Path:
+    """The folder of the predictor that comes with the package.
+
+    Raises:
+        CheckpointError: None came with it.
+    """
+    path = Path(str(files("foretrace.predictor"))) / DEFAULT
+    if not (path / CONFIG).is_file():
+        raise CheckpointError(
+            "this installation comes without a trained predictor: name the folder of a training, from `foretrace train`"
+        )
+    return path
+
+
+def load_predictor(path: str | Path | None = None) -> EffectPredictor:
     """Read a predictor from a folder that `save_checkpoint` or `train_predictor` wrote.
+
+    Args:
+        path: The folder; by default that of the predictor that comes with the package.
 
     Raises:
         CheckpointError: A file is missing or damaged, of another version, or the tensors do not fit.
     """
-    path = Path(path)
+    path = default_checkpoint() if path is None else Path(path)
     config = read_config(path)
     model = path / MODEL
     if not model.is_file():

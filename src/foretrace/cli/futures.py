@@ -1,0 +1,90 @@
+"""What a predictor says beside one motion: what else may happen, how sure it is, and what is unusual."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from foretrace.cli.console import say
+
+if TYPE_CHECKING:
+    from foretrace.evaluation.tubes import Outlook
+    from foretrace.predictor import Futures, ImaginedEffect
+
+LEVEL = 0.9
+"""Probability of the region that is told of."""
+LARGEST_RADIUS = 0.5
+"""A wider region says nothing and is not drawn [m]."""
+LEAST_PROBABLE = 0.01
+"""Futures less probable than this are not drawn."""
+
+
+def outlook_of(imagined: "ImaginedEffect") -> "Outlook":
+    """What to draw beside the path."""
+    from foretrace.evaluation.tubes import Outlook
+
+    futures, radius = imagined.futures, radius_of(imagined)
+    if futures is None:
+        return Outlook()
+    others = [k for k in _in_order(futures)[1:] if futures.probability[0, k] >= LEAST_PROBABLE]
+    if radius is not None and radius.max() > LARGEST_RADIUS:
+        radius = None
+    return Outlook(
+        imagined.com_trajectory,
+        radius,
+        LEVEL,
+        [(f"{futures.outcome[k]} {futures.probability[0, k]:.0%}", futures.com[0, k]) for k in others],
+    )
+
+
+def _in_order(futures: "Futures") -> list[int]:
+    """Futures, the most probable one first."""
+    return np.argsort(-futures.probability[0], kind="stable").tolist()
+
+
+def radius_of(imagined: "ImaginedEffect") -> np.ndarray | None:
+    """Radius of the region about the path [m]; None where the predictor does not tell, or nobody knows."""
+    if imagined.futures is None:
+        return None
+    radius = imagined.futures.radius(LEVEL)[0, _in_order(imagined.futures)[0]]
+    return radius if np.isfinite(radius).all() else None
+
+
+def say_futures(imagined: "ImaginedEffect") -> None:
+    """Print outcomes, support edge and radius; what is unusual goes to the terminal as warnings."""
+    for warning in imagined.warnings:
+        say(f"warning: {warning}")
+    futures = imagined.futures
+    if futures is None:
+        return
+    probable = sorted(futures.outcomes().items(), key=lambda item: -item[1][0])
+    print("outcome: " + ", ".join(f"{name} {probability[0]:.1%}" for name, probability in probable))
+    (x0, y0), (x1, y1) = 100 * futures.support_points[0, _in_order(futures)[0]]
+    print(
+        f"turns about the edge from x {x0:.1f}, y {y0:.1f} to x {x1:.1f}, y {y1:.1f} cm in the action frame"
+    )
+    radius = radius_of(imagined)
+    told = "not known: the validation part was too small" if radius is None else f"{100 * radius[-1]:.2f} cm"
+    print(f"radius of the {LEVEL:.0%} region at the end: {told}")
+
+
+def futures_content(imagined: "ImaginedEffect") -> dict[str, Any]:
+    """The same for ``trajectory.json``; futures are in the order of their probability, null where nothing is known."""
+    content: dict[str, Any] = {"warnings": list(imagined.warnings)}
+    futures = imagined.futures
+    if futures is None:
+        return content
+    radii = futures.radius(LEVEL)[0]
+    content["outcomes"] = {name: float(p[0]) for name, p in futures.outcomes().items()}
+    content["level"] = LEVEL
+    content["futures"] = [
+        {
+            "outcome": futures.outcome[k],
+            "probability": float(futures.probability[0, k]),
+            "com_trajectory": futures.com[0, k].tolist(),
+            "pose_trajectory": futures.pose[0, k].tolist(),
+            "radius": radii[k].tolist() if np.isfinite(radii[k]).all() else None,
+            "support_points": futures.support_points[0, k].tolist(),
+        }
+        for k in _in_order(futures)
+    ]
+    return content

@@ -1,0 +1,225 @@
+"""What somebody who is handed a predictor has to know of it: a page in Markdown, made from its run and its data."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foretrace.errors import TrainingError
+from foretrace.evaluation.experiments import STARTS
+from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.predictor import EffectPredictor, load_predictor, part_of
+from foretrace.predictor.checkpoint import read_config
+from foretrace.predictor.domain import MEASURES, QUANTILES
+from foretrace.predictor.futures import LEVELS, conformal_scores
+from foretrace.predictor.run_folder import ENVIRONMENT
+from foretrace.predictor.states import valid_samples
+from foretrace.trajectories import final_distance, mean_distance
+
+PARTS = ("train", "validation", "test")
+SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""Levels of the regions that the card tells of."""
+CM = 100.0
+OPTIONS = (
+    *("features", "state", "steps_ahead", "hidden", "epochs", "batch_size", "learning_rate"),
+    *("known", "outcomes", "split", "seed"),
+)
+"""Settings that are options of ``foretrace train``."""
+LIMITS = """\
+- It knows one action, the lever-up, with the tool path of its data, and rigid objects that lie alone on a flat table.
+- It has learned from simulation. How far a real object is from it is not part of this card.
+- Probabilities and regions hold for lever-ups like those in the data: an object that is unlike them is pointed out, an
+  unlike friction, density, rim or tool is not.
+- A view that shows several objects, none, or no contact at the object's rim is refused."""
+
+
+def model_card(run: Path, data: Path) -> str:
+    """The card of a training.
+
+    Args:
+        run: Folder of the training.
+        data: The data set that it was trained on. Errors and coverage are those of the test part.
+
+    Raises:
+        CheckpointError: There is no finished predictor.
+        TrainingError: The data set is another one, or the folder does not tell what the training ran on.
+    """
+    predictor, dataset = load_predictor(run), Dataset.open(data)
+    parts = {part: part_of(run, dataset, part) for part in PARTS}
+    test, families = parts["test"], _families(dataset)
+    sections = {
+        f"Model card: {predictor.label} predictor with features {predictor.features.label}": _about(
+            predictor
+        ),
+        "Data": _data(dataset, data, parts, families),
+        "Training": _training(run, data),
+        "Errors on the test part": _errors(predictor, test, families),
+        "Outcomes and regions on the test part": _calibration(predictor, test),
+        "Objects that it was trained on": _ranges(predictor),
+        "Limits": LIMITS,
+    }
+    return "\n\n".join(
+        f"{'#' if k == 0 else '##'} {title}\n\n{text}" for k, (title, text) in enumerate(sections.items()) if text
+    ) + "\n"  # fmt: skip
+
+
+def _about(predictor: EffectPredictor) -> str:
+    times = predictor.times.tolist()
+    known = f", is told {', '.join(predictor.known)}" if predictor.known else ""
+    outcomes = f", tells apart {', '.join(predictor.outcomes)}" if predictor.outcomes else ""
+    told = "the centre of mass" if predictor.state == "position" else "the pose"
+    return (
+        f"Imagines {told} of a levered object from the view from above: {len(times)} samples in {times[-1]:.2f} s, in "
+        f"the action frame, SI units{known}{outcomes}. {sum(p.numel() for p in predictor.parameters())} weights."
+    )
+
+
+def _data(
+    dataset: Dataset, data: Path, parts: Mapping[str, InteractionBatch], families: Mapping[int, str]
+) -> str:
+    settings = dict(_flat(dataset.manifest["configuration"]))
+    told = ", ".join(f"{name} {value}" for name, value in settings.items())
+    rows = []
+    for outcome in sorted({str(name) for batch in parts.values() for name in batch.outcome}):
+        for family in sorted(set(families.values())):
+            counts = [int(_mask(batch, families, outcome, family).sum()) for batch in parts.values()]
+            if any(counts):
+                rows.append([outcome, family, *map(str, counts)])
+    rows.append(["all", "", *(str(len(batch)) for batch in parts.values())])
+    return f"`{data.name}`, simulated with: {told}.\n\n" + _table(["Outcome", "Objects", *PARTS], rows)
+
+
+def _training(run: Path, data: Path) -> str:
+    training = read_config(run)["training"]
+    command = [f"foretrace train --data {data} --out {run} --predictor {training.get('predictor', 'lstm')}"]
+    for name in OPTIONS:
+        value = training.get(name)
+        if value is None or value == [] or value == ():
+            continue
+        said = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        command.append(f"--{name.replace('_', '-')} {said}")
+    command += [f"--{name} {value}" for name, value in training.get("predictor_options", {}).items()]
+    if training.get("feature_options", {}).get("heights"):
+        command.append("--heights")
+    try:
+        environment = json.loads((run / ENVIRONMENT).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise TrainingError(
+            f"{run / ENVIRONMENT} cannot be read: give the whole folder of a training"
+        ) from error
+    versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
+    return (
+        f"```console\n$ {' '.join(command)}\n```\n\nCommit {environment['commit'] or 'unknown'}; {versions}; on "
+        f"{environment['device']} in {environment['precision']}. The data's fingerprint is `{training['data']}`."
+    )
+
+
+def _errors(predictor: EffectPredictor, test: InteractionBatch, families: Mapping[int, str]) -> str:
+    valid = valid_samples(test, predictor.lengths(test))
+    truth = np.where(valid[..., None], test.com, np.nan)
+    rows = []
+    for start in STARTS:
+        imagined = predictor.imagine_batch(test, start).com
+        full, final = (
+            CM * np.asarray(measure(imagined, truth)) for measure in (mean_distance, final_distance)
+        )
+        for name, mine in (
+            _groups(test, families) if start == STARTS[0] else [("all", np.ones(len(test), bool))]
+        ):
+            numbers = [f"{f(e[mine]):.3f}" for e in (full, final) for f in (np.nanmean, np.nanmedian, _p95)]
+            rows.append([name, start, str(int(mine.sum())), *numbers])
+    head = [
+        "Interactions",
+        "Start",
+        "Count",
+        *(f"{w}, {m}" for w in ("full", "final") for m in ("mean", "median", "p95")),
+    ]
+    until = "the whole record" if predictor.outcomes else "the record up to where the object slipped"
+    return (
+        f"Distance of the imagined centre of mass from where it was [cm], over {until} and at its end. `observed`: the "
+        f"first centre of mass was given; `estimated`: it was judged from the view.\n\n{_table(head, rows)}"
+    )
+
+
+def _calibration(predictor: EffectPredictor, test: InteractionBatch) -> str:
+    imagined = predictor.imagine_batch(test)
+    futures = imagined.futures
+    if futures is None:
+        return ""
+    names = list(futures.outcomes())
+    said = np.array(names)[np.argmax(list(futures.outcomes().values()), axis=0)]
+    common = max(float(np.mean(test.outcome == name)) for name in names)
+    lengths = predictor.lengths(test)
+    scores = conformal_scores(futures, test.com, lengths)
+    rows = []
+    for level in SHOWN_LEVELS:
+        held = scores <= np.interp(level, LEVELS, futures.quantiles)
+        radius = futures.radius(level)[np.arange(len(test)), futures.probability.argmax(axis=1)]
+        end = CM * float(np.median(radius[np.arange(len(test)), lengths - 1]))
+        rows.append([f"{level:.0%}", f"{held.mean():.1%}", f"{end:.2f}" if np.isfinite(end) else "unknown"])
+    right = np.mean(said == test.outcome)
+    return (
+        f"The most probable outcome is what happened in {right:.1%} of {len(test)} interactions; "
+        f"always saying the most common one is right in {common:.1%}. A region holds whole motions.\n\n"
+        + _table(["Region", "Held", "Median radius at the end [cm]"], rows)
+    )
+
+
+def _ranges(predictor: EffectPredictor) -> str:
+    rows = []
+    for name, (low, high) in predictor.ranges.items():
+        factor, unit = MEASURES[name]
+        rows.append([name, f"{factor * low:.3g}", f"{factor * high:.3g}", unit])
+    if not rows:
+        return ""
+    low, high = (f"{q:.0%}" for q in QUANTILES)
+    return (
+        "What `imagine` warns of is far outside these. Length and width are along and across the action, the distance "
+        f"is from contact to centre of mass.\n\n{_table(['Measure', low, high, 'Unit'], rows)}"
+    )
+
+
+def _families(dataset: Dataset) -> dict[int, str]:
+    """Kind of object of each interaction, by id; the corners of flat ones are counted."""
+    kinds = (json.loads(text)["kind"] for text in dataset.table["object"].to_pylist())
+    corners, ids = (dataset.table[name].to_pylist() for name in ("num_corners", "id"))
+    return {
+        id: f"{kind}, {number} corners" if kind == "prism" else kind
+        for id, kind, number in zip(ids, kinds, corners, strict=True)
+    }
+
+
+def _mask(batch: InteractionBatch, families: Mapping[int, str], outcome: str, family: str) -> np.ndarray:
+    return (batch.outcome == outcome) & np.array(
+        [families[int(id)] == family for id in batch.ids], dtype=bool
+    )
+
+
+def _groups(batch: InteractionBatch, families: Mapping[int, str]) -> Iterator[tuple[str, np.ndarray]]:
+    """All, those of each outcome, those of each family: name and members."""
+    yield "all", np.ones(len(batch), dtype=bool)
+    for name in np.unique(batch.outcome):
+        yield str(name), batch.outcome == name
+    kinds = np.array([families[int(id)] for id in batch.ids])
+    for name in np.unique(kinds):
+        yield str(name), kinds == name
+
+
+def _p95(values: np.ndarray) -> float:
+    return float(np.nanpercentile(values, 95))
+
+
+def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Settings without the tool's and its path's, which every data set has."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from () if name in ("path", "tool") else _flat(value)
+        elif value is not None:
+            yield name.replace("_", " "), value
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,243 @@
+"""What the command line says of several futures, the model card, and the predictor that comes with the package."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import factories
+import foretrace as ft
+from export_samples import write_data
+from foretrace import cli
+from foretrace.cli.futures import futures_content, outlook_of, radius_of, say_futures
+from foretrace.errors import CheckpointError
+from foretrace.evaluation.figures import Scene, legend_of, scene_figure
+from foretrace.interactions.dataset import Dataset
+from foretrace.predictor import RECIPES, Futures, ImaginedEffect, checkpoint, part_of, train_predictor
+from foretrace.predictor.futures import LEVELS, conformal_scores
+
+SAMPLES = 24
+CONFIG = replace(
+    RECIPES["one-shot"],
+    hidden=8,
+    predictor_options={"motions": 6},
+    epochs=2,
+    min_steps=1,
+    split=None,
+    outcomes=("levered", "slipped"),
+    device="cpu",
+)
+SHIPPED = Path(ft.__file__).parent / "predictor" / "default"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    interactions = factories.fake_interactions(np.random.default_rng(0), 40, num_samples=SAMPLES)
+    return write_data(tmp_path_factory.mktemp("one-shot") / "data", interactions)
+
+
+@pytest.fixture(scope="module")
+def run(data: Path) -> Path:
+    return train_predictor(Dataset.open(data), CONFIG, data.parent / "run", progress=False)
+
+
+@pytest.fixture(scope="module")
+def card(run: Path, data: Path) -> str:
+    assert cli.main(["card", str(run), "--data", str(data)]) == 0
+    return (run / "MODEL_CARD.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory) -> Path:
+    silhouette = np.zeros((200, 200), np.uint8)
+    cv2.fillPoly(silhouette, [np.array([[40, 60], [150, 50], [170, 120], [100, 160], [50, 130]])], 255)
+    file = tmp_path_factory.mktemp("shape") / "shape.png"
+    cv2.imwrite(str(file), silhouette)
+    return file
+
+
+def imagined_effect(probability=(0.7, 0.25, 0.045, 0.005)) -> ImaginedEffect:
+    """Four straight paths; the first is the most probable one."""
+    n, times = len(probability), np.linspace(0, 1, 5)
+    com = np.zeros((1, n, 5, 3))
+    com[0, :, :, 0] = 0.05 + np.linspace(0, 0.04, 5)
+    com[0, :, :, 2] = 0.01 * np.arange(n)[:, None] + np.linspace(0, 0.05, 5)
+    spread = np.linspace(0, 0.0099, 5)
+    ends = np.broadcast_to([[0.1, -0.05], [0.1, 0.04]], (1, n, 2, 2))
+    pose = np.concatenate([com, np.broadcast_to([1.0, 0, 0, 0], (1, n, 5, 4))], axis=-1)
+    futures = Futures(
+        np.array([probability]), ("levered", "slipped") * (n // 2), com, pose,
+        np.broadcast_to(spread, (1, n, 5)), ends, 2 * np.ones(len(LEVELS)),
+    )  # fmt: skip
+    return ImaginedEffect(times, com[0, 0], pose[0, 0], futures, ("height 9 cm is unusual",))
+
+
+def test_futures_are_told_in_words(capsys):
+    say_futures(imagined_effect())
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        "outcome: levered 74.5%, slipped 25.5%",
+        "turns about the edge from x 10.0, y -5.0 to x 10.0, y 4.0 cm in the action frame",
+        "radius of the 90% region at the end: 2.00 cm",
+    ]
+    assert said.err.strip() == "foretrace: warning: height 9 cm is unusual"
+
+
+def test_nobody_says_more_than_is_known(capsys):
+    effect = imagined_effect()
+    unsure = replace(
+        effect, futures=replace(effect.futures, quantiles=np.full(len(LEVELS), np.inf)), warnings=()
+    )
+    say_futures(unsure)
+    assert "not known" in capsys.readouterr().out
+    assert radius_of(unsure) is None
+    assert futures_content(unsure)["futures"][0]["radius"] is None
+    assert outlook_of(unsure).radius is None
+    single = replace(unsure, futures=None)
+    say_futures(single)
+    assert capsys.readouterr() == ("", "")
+    assert futures_content(single) == {"warnings": []}
+
+
+def test_futures_are_written_in_the_order_of_their_probability():
+    effect = imagined_effect()
+    order = replace(effect, futures=replace(effect.futures, probability=effect.futures.probability[:, ::-1]))
+    content = json.loads(json.dumps(futures_content(order)))
+    assert [future["probability"] for future in content["futures"]] == [0.7, 0.25, 0.045, 0.005]
+    assert content["futures"][0]["com_trajectory"] == effect.futures.com[0, 3].tolist()
+    # No region holds what is hardly probable.
+    assert [future["radius"] is None for future in content["futures"]] == [False, False, True, True]
+    assert sum(content["outcomes"].values()) == pytest.approx(1)
+
+
+def test_less_probable_futures_and_the_region_are_drawn():
+    effect = imagined_effect()
+    outlook = outlook_of(effect)
+    assert [name for name, _ in outlook.others] == ["slipped 25%", "levered 4%"]
+    np.testing.assert_allclose(outlook.radius[-1], 0.02)
+    prism = ft.Prism([(0, -0.06), (0.12, -0.06), (0.12, 0.06), (0, 0.06)])
+    action = ft.LeverUp.at_edge(prism, 3)
+    scene = Scene.imagined(prism, action, effect.times, {"one-shot": effect.com_trajectory})
+    plain, drawn = scene_figure(scene), scene_figure(replace(scene, outlook=outlook))
+    for before, after in zip(plain.axes, drawn.axes, strict=True):
+        assert len(after.lines) == len(before.lines) + 2
+        assert (
+            len(after.patches) + len(after.collections) == len(before.patches) + len(before.collections) + 1
+        )
+    labels = [handle.get_label() for handle in legend_of(replace(scene, outlook=outlook))]
+    assert labels[1:] == ["region of 90%", "less probable: slipped 25%, levered 4%"]
+    # The region is as wide as its radius says, and in sight.
+    above = drawn.axes[0]
+    band = max((patch.get_path().vertices for patch in above.patches), key=lambda ring: ring[:, 1].max())
+    assert np.ptp(band[:, 0]) >= 3.9
+    assert above.get_ylim()[1] > 11
+
+
+def test_predict_tells_of_futures(run: Path, picture: Path, tmp_path: Path, capsys) -> None:
+    command = ["predict", str(run), "--image", str(picture), "--scale", "0.0014", "--edge", "2"]
+    assert cli.main([*command, "--no-animation", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"^outcome: (levered|slipped) \d+\.\d%, ", printed)
+    content = json.loads((tmp_path / "trajectory.json").read_text())
+    assert content["com_trajectory"] == content["futures"][0]["com_trajectory"]
+    assert len(content["futures"]) == 4
+    assert content["warnings"] == []
+    assert (tmp_path / "prediction.png").stat().st_size > 10_000
+
+
+def test_without_a_run_the_shipped_predictor_is_used(
+    run: Path, picture: Path, tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.setattr(checkpoint, "DEFAULT", "nothing-here")
+    with pytest.raises(
+        CheckpointError, match="comes without a trained predictor: name the folder of a training"
+    ):
+        ft.load_predictor()
+    command = ["predict", "--image", str(picture), "--scale", "0.0014", "--edge", "2", "--no-animation"]
+    assert cli.main([*command, "--out", str(tmp_path)]) == 2
+    assert "comes without a trained predictor" in capsys.readouterr().err
+    monkeypatch.setattr(checkpoint, "DEFAULT", str(run))
+    assert cli.main([*command, "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "trajectory.json").read_text())["predictor"] == "default"
+
+
+@pytest.mark.skipif(
+    not SHIPPED.is_dir(), reason="the predictor that comes with the package is still to be trained"
+)
+def test_the_shipped_predictor_imagines():
+    predictor = ft.load_predictor()
+    box = ft.Box(0.14, 0.1, 0.02)
+    imagined = predictor.imagine(ft.TopDownView.of(box, ft.LeverUp.at_edge(box, 0)))
+    assert imagined.warnings == ()
+    assert (
+        max(imagined.futures.outcomes(), key=lambda name: imagined.futures.outcomes()[name][0]) == "levered"
+    )
+    assert 0.01 < np.ptp(imagined.com_trajectory[:, 2]) < 0.1
+    assert (SHIPPED / "MODEL_CARD.md").read_text().startswith("# Model card")
+
+
+def rows_of(card: str, section: str) -> list[list[str]]:
+    """Cells of the table in a section."""
+    text = card.split(f"## {section}\n")[1].split("\n## ")[0]
+    return [
+        [c.strip() for c in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")
+    ][2:]
+
+
+def test_the_card_counts_the_data(card: str, run: Path) -> None:
+    rows = rows_of(card, "Data")
+    parts = json.loads((run / "split.json").read_text())
+    assert rows[-1] == ["all", "", *(str(len(parts[part])) for part in ("train", "validation", "test"))]
+    counts = np.array([row[2:] for row in rows[:-1]], dtype=int)
+    assert counts.sum(axis=0).tolist() == [len(parts[part]) for part in ("train", "validation", "test")]
+    assert {row[0] for row in rows[:-1]} == {"levered", "slipped"}
+    assert all(re.fullmatch(r"prism, \d+ corners", row[1]) for row in rows[:-1])
+
+
+def test_the_card_has_the_errors_of_the_test_part(card: str, run: Path, data: Path, tmp_path: Path) -> None:
+    first, *_, last = rows_of(card, "Errors on the test part")
+    test, predictor = part_of(run, Dataset.open(data)), ft.load_predictor(run)
+    imagined = predictor.imagine_batch(test)
+    apart = np.linalg.norm(imagined.com - test.com, axis=-1)
+    assert first[:3] == ["all", "observed", str(len(test))]
+    assert float(first[3]) == pytest.approx(100 * np.nanmean(np.nanmean(apart, axis=1)), abs=6e-4)
+    ends = 100 * apart[np.arange(len(test)), test.length - 1]
+    assert float(first[7]) == pytest.approx(np.median(ends), abs=6e-4)
+    assert last[:2] == ["all", "estimated"]
+    scores = conformal_scores(imagined.futures, test.com, test.length)
+    held = np.mean(scores <= imagined.futures.quantiles[49])
+    assert rows_of(card, "Outcomes and regions on the test part")[0][:2] == ["50%", f"{held:.1%}"]
+    table = pd.DataFrame(rows_of(card, "Objects that it was trained on"))
+    assert table[0].tolist() == ["area", "length", "width", "height", "distance", "corners"]
+
+
+def test_the_command_on_the_card_asks_for_the_same_training(card: str, run: Path, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(
+        "foretrace.predictor.train_predictor", lambda data, config, out, **_: asked.append(config)
+    )
+    command = re.search(r"^\$ foretrace (train .*)$", card, re.MULTILINE)
+    assert command is not None
+    assert cli.main(command[1].split()) == 0
+    # What is no option of the command was made small for this test.
+    assert replace(asked[0], min_steps=1, device="cpu") == CONFIG
+    assert json.loads((run / "environment.json").read_text())["versions"]["torch"] in card
+
+
+def test_a_card_needs_the_data_of_the_run(run: Path, tmp_path: Path, capsys) -> None:
+    other = write_data(
+        tmp_path / "data", factories.fake_interactions(np.random.default_rng(1), 4, num_samples=SAMPLES)
+    )
+    assert cli.main(["card", str(run), "--data", str(other)]) == 2
+    assert "give the data set that it was trained on" in capsys.readouterr().err
