@@ -116,8 +116,10 @@ class Mixture:
     """Logarithms of probabilities."""
     mean: Float[Tensor, "batch hinges outcomes motions"]
     """Expected weights."""
-    factor: Float[Tensor, "batch hinges outcomes motions motions"]
-    """Cholesky factors of their covariances."""
+    error: Float[Tensor, "batch hinges outcomes"]
+    """How large errors are expected to be."""
+    root: Float[Tensor, "#batch #hinges outcomes motions motions"]
+    """Square roots of the covariances of weights, for errors of 1; the same for all until something is observed."""
     motions: Float[Tensor, "motions time 6"]
     """Principal motions along a hinge's axes [m]; turns times ``TURN_LENGTH``."""
     mean_motion: Float[Tensor, "time 6"]
@@ -138,7 +140,7 @@ class Mixture:
         motion = torch.cat([observed[..., :3] - self.com[:, None], TURN_LENGTH * observed[..., 3:]], dim=-1)
         seen = along_hinges(self.axes, motion)  # (batch, hinges, samples, 6)
         # What is known exactly and what is hardly known lie orders of magnitude apart: too many for float32.
-        basis, factor = self.motions[:, :k].flatten(1).double(), self.factor.double()
+        basis, factor = self.motions[:, :k].flatten(1).double(), self._factor().double()
         off = (seen - self.mean_motion[:k]).double().flatten(2)[:, :, None] - self.mean.double() @ basis
         # Of unit weights z, of which the motion is a linear image.
         image = factor.mT @ basis / NOISE
@@ -159,8 +161,8 @@ class Mixture:
         unit = torch.eye(len(basis), dtype=root.dtype, device=root.device).expand_as(root)
         inverse = torch.linalg.solve_triangular(root, unit, upper=False) * wider[..., None, None]
         # (factor inverse^T) (factor inverse^T)^T is the covariance; any square root of it will do.
-        spread = (factor @ inverse.mT).to(self.factor)
-        return replace(self, odds=odds, mean=mean, factor=spread, observed=observed)
+        root = (factor @ inverse.mT).to(self.root)
+        return replace(self, odds=odds, mean=mean, error=torch.ones_like(odds), root=root, observed=observed)
 
     def most_probable(self) -> Float[Tensor, "batch time 6"]:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
@@ -181,15 +183,18 @@ class Mixture:
         rows = torch.arange(len(self.com), device=self.com.device)[:, None]
         chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
         z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
-        factor = self.factor.flatten(1, 2)[rows, chosen]
+        factor = self._factor().flatten(1, 2)[rows, chosen]
         weights = self.mean.flatten(1, 2)[rows, chosen] + (factor @ z[..., None].to(factor))[..., 0]
         return self._states(weights, self.axes[rows, chosen // self.odds.shape[2]])
 
     def spread(self) -> Float[Tensor, "batch futures time"]:
         """Root mean square of the distance from each future's positions [m]."""
-        displaced = self.motions[..., :3]
-        images = torch.einsum("bfij,itc->bfjtc", self.factor.flatten(1, 2), displaced)
-        return images.square().sum(dim=(2, 4)).sqrt()
+        displaced = self.motions[..., :3].flatten(1)  # (motions, time 3)
+        images = (self.root.mT @ displaced).unflatten(-1, (-1, 3))
+        return (self.error[..., None] * images.square().sum(dim=(-3, -1)).sqrt()).flatten(1, 2)
+
+    def _factor(self) -> Float[Tensor, "batch hinges outcomes motions motions"]:
+        return self.error[..., None, None] * self.root
 
     def _states(self, weights: Tensor, axes: Float[Tensor, "batch futures 3 3"]) -> Tensor:
         motion = (weights @ self.motions.flatten(1)).unflatten(-1, self.mean_motion.shape) + self.mean_motion

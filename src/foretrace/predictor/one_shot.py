@@ -404,7 +404,8 @@ class OneShotPredictor(EffectPredictor):
             ends=hinges.ends,
             odds=odds.flatten(1).log_softmax(dim=1).view_as(odds),
             mean=(weights * seen[:, None, None]).mean(dim=1),
-            factor=error[..., None, None] * root,
+            error=error,
+            root=root[None, None],
             motions=self.motions,
             mean_motion=self.mean_motion,
             observed=no_observations(com),
@@ -435,11 +436,7 @@ class OneShotPredictor(EffectPredictor):
         off = truth - self.mean_motion.flatten() - mean @ motions
         better = off.square().sum(dim=2).argmin(dim=1)
         weights = off[rows, better] @ motions.mT / motions.square().sum(dim=1).clamp(min=1e-12)
-        # The factor of a unit covariance would be the expected error.
-        said = (
-            mixture.factor[rows, better, effects.outcomes, 0, 0]
-            / torch.linalg.cholesky(self.covariance)[effects.outcomes, 0, 0]
-        )
+        said = mixture.error[rows, better, effects.outcomes]
         return weights / said[:, None]
 
     # --- from states to motions ---------------------------------------------------------------------------

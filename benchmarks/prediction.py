@@ -1,0 +1,80 @@
+"""How long a prediction takes: one view, many contacts of one object, and the same lever-ups simulated instead.
+
+Prediction and simulation take turns on one core, so that a machine whose speed drifts changes both. Times are those of
+the processor, medians over objects. Run it on an idle machine.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from foretrace.actions import LeverUp, sample_contacts
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import Prism, sample_prism
+from foretrace.predictor import OneShotPredictor, load_predictor
+from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+
+CONTACTS = 512
+SIMULATED = 4
+"""Lever-ups of each object that are simulated for comparison."""
+
+
+def seconds(work: Callable[[], object], repeats: int = 1) -> float:
+    """Processor time of one call, in the mean over repeats."""
+    start = time.process_time()
+    for _ in range(repeats):
+        work()
+    return (time.process_time() - start) / repeats
+
+
+def contacts_of(prism: Prism, first: LeverUp, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Contact points around a prism and directions there, in the action frame of its first lever-up."""
+    per_edge = -(-CONTACTS // len(prism.corners))
+    actions = sample_contacts(prism, rng, per_edge=per_edge)[:CONTACTS]
+    frames = [first.T_action_object @ np.linalg.inv(action.T_action_object) for action in actions]
+    return np.array([frame[:2, 3] for frame in frames]), np.array([frame[:2, 0] for frame in frames])
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, help="folder of a training of the one-shot predictor")
+    parser.add_argument("--objects", type=int, default=12)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    predictor = load_predictor(arguments.run)
+    if not isinstance(predictor, OneShotPredictor):
+        raise SystemExit(f"{arguments.run} holds a {predictor.label} predictor: give a one-shot one")
+    rows = []
+    for k in range(arguments.objects + 1):
+        rng = np.random.default_rng(k)
+        prism = sample_prism(rng, 3 + k % 8)
+        actions = sample_contacts(prism, rng, per_edge=2)
+        view = TopDownView.of(prism, actions[0])
+        contacts, directions = contacts_of(prism, actions[0], rng)
+        known = dict.fromkeys(predictor.known, 0.5)
+        one = seconds(lambda: predictor.imagine(view, known=known), 20)  # noqa: B023
+        many = seconds(lambda: predictor.imagine_contacts(view, contacts, directions, known=known), 2)  # noqa: B023
+        simulated = [
+            seconds(lambda: simulate_lever_up(prism, action, SimulationConfig(embodiment="tool")))  # noqa: B023
+            for action in actions[:SIMULATED]
+        ]
+        if k:  # the first object warms up
+            rows.append((one, many, float(np.mean(simulated))))
+    one, many, simulated = 1e3 * np.median(rows, axis=0)
+    print(
+        f"one view to futures:      {one:8.2f} ms, simulated {simulated:.1f} ms: {simulated / one:.0f} times as fast"
+    )
+    each = many / CONTACTS
+    print(
+        f"{CONTACTS} contacts, one view:   {many:8.1f} ms, {each:.3f} ms each: {simulated / each:.0f} times as fast as "
+        "simulating them, the blade alone"
+    )
+
+
+if __name__ == "__main__":
+    main()
