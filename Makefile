@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/installed
 
-.PHONY: setup demo test check bench figures docs clean
+.PHONY: setup demo test check bench figures checkpoint docs clean
 
 setup: $(STAMP)
 
@@ -34,6 +34,15 @@ bench: setup
 
 figures: setup
 	$(BIN)/foretrace figures docs/results/paper
+
+# The predictor that comes with the package: some 20 minutes on two cores.
+checkpoint: setup
+	$(BIN)/foretrace simulate --recipe mixed --randomise --objects 500 --seed 3 --out data/default
+	$(BIN)/foretrace train --data data/default --predictor one-shot --heights --hidden 192 --motions 64 --epochs 100 \
+		--outcomes levered slipped tumbled rolled missed --split 4000 450 550 --threads 1 --out runs/default
+	$(BIN)/foretrace card runs/default --data data/default
+	cp runs/default/config.json runs/default/model.safetensors runs/default/MODEL_CARD.md \
+		src/foretrace/predictor/default
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -172,9 +172,6 @@ def test_without_a_run_the_shipped_predictor_is_used(
     assert json.loads((tmp_path / "trajectory.json").read_text())["predictor"] == "default"
 
 
-@pytest.mark.skipif(
-    not SHIPPED.is_dir(), reason="the predictor that comes with the package is still to be trained"
-)
 def test_the_shipped_predictor_imagines():
     predictor = ft.load_predictor()
     box = ft.Box(0.14, 0.1, 0.02)

@@ -63,6 +63,7 @@ def _drawn(
     """The film's pictures with outline and paths in them."""
     import numpy as np
 
+    from foretrace.cli.futures import radius_of
     from foretrace.geometry import pose_to_matrix, transform_points
     from foretrace.interactions.pinhole import PinholeCamera
     from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
@@ -73,7 +74,7 @@ def _drawn(
     obj, effect = interaction.object, interaction.effect
     rim = np.column_stack([obj.corners, np.full(len(obj.corners), obj.height)])
     poses = pose_to_matrix(effect.pose_trajectory)
-    radius = getattr(imagined, "radius", None)
+    radius = radius_of(imagined)
     for frame in frames:
         time = frame.time - notes["start"]
         here = np.eye(4)

@@ -45,6 +45,9 @@ SAME = 0.01
 """A number seen from hinges that varies by less (a millimetre, half a degree) counts as the same everywhere."""
 FEW = 10
 """So many lever-ups with an outcome tell how much they scatter."""
+LARGEST_ERROR = 1.5
+"""Logarithm of the largest error to be expected, in units of the position's scale: of futures that nobody expects,
+networks say anything."""
 SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step looks at: it makes the step cheaper."""
 
@@ -394,7 +397,8 @@ class OneShotPredictor(EffectPredictor):
         root = torch.linalg.cholesky(self.covariance) if root is None else root
         hinges = self._see(features, com)
         said = self._say(features, hinges)
-        weights, error = said.weights.mean(dim=0), said.error.mean(dim=(0, 2)).exp() * self.state_scale[0]
+        weights = said.weights.mean(dim=0)
+        error = said.error.mean(dim=(0, 2)).clamp(max=LARGEST_ERROR).exp() * self.state_scale[0]
         odds = said.odds.flatten(3).log_softmax(dim=-1).view_as(said.odds).mean(dim=(0, 2))
         # What the motion in the mirror is here.
         seen = torch.stack([torch.ones_like(self.parity), self.parity])[: weights.shape[1]]
