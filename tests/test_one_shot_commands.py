@@ -172,24 +172,18 @@ def test_without_a_run_the_shipped_predictor_is_used(
     assert json.loads((tmp_path / "trajectory.json").read_text())["predictor"] == "default"
 
 
-def test_the_shipped_predictor_imagines():
+@pytest.mark.parametrize(("edge", "outcome"), [(0, "slipped"), (1, "levered")])
+def test_the_shipped_predictor_tells_what_becomes_of_a_box(edge: int, outcome: str) -> None:
+    # What the simulator makes of it, too: wide in front of the blade it slips, along its length it is levered.
     predictor = ft.load_predictor()
     box = ft.Box(0.14, 0.1, 0.02)
-    imagined = predictor.imagine(ft.TopDownView.of(box, ft.LeverUp.at_edge(box, 0)))
+    imagined = predictor.imagine(ft.TopDownView.of(box, ft.LeverUp.at_edge(box, edge)))
     assert imagined.warnings == ()
-    assert (
-        max(imagined.futures.outcomes(), key=lambda name: imagined.futures.outcomes()[name][0]) == "levered"
-    )
-    assert 0.01 < np.ptp(imagined.com_trajectory[:, 2]) < 0.1
+    assert imagined.futures is not None
+    probability = {name: float(p[0]) for name, p in imagined.futures.outcomes().items()}
+    assert max(probability, key=lambda name: probability[name]) == outcome
+    assert 0.002 < np.ptp(imagined.com_trajectory[:, 2]) < 0.1
     assert (SHIPPED / "MODEL_CARD.md").read_text().startswith("# Model card")
-
-
-def rows_of(card: str, section: str) -> list[list[str]]:
-    """Cells of the table in a section."""
-    text = card.split(f"## {section}\n")[1].split("\n## ")[0]
-    return [
-        [c.strip() for c in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")
-    ][2:]
 
 
 def test_the_card_counts_the_data(card: str, run: Path) -> None:
