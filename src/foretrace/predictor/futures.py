@@ -17,6 +17,8 @@ NOISE = 5e-4
 """What an observed position may be off [m]; also what principal motions leave out."""
 FREEDOM = 4.0
 """Degrees of freedom of the Student distribution of errors: the fewer, the heavier its tails."""
+DOUBT = 2.0
+"""A future loses probability where the beginning is farther from it than so many times what was expected."""
 COORDINATES = 6
 """A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
 TURN_LENGTH = 0.05
@@ -128,9 +130,10 @@ class Mixture:
     """Positions [m] and rotation vectors [rad] that were observed."""
 
     def given(self, observed: Float[Tensor, "batch samples 6"]) -> "Mixture":
-        """The mixture after the first samples were observed, by Bayes' rule.
+        """The mixture after the first samples were observed.
 
-        Conditional multivariate Student distributions (Roth, 2013, "On the multivariate t distribution"). Regions that
+        Conditional multivariate Student distributions (Roth, 2013, "On the multivariate t distribution"), of which
+        those lose probability that the beginning does not fit. Regions that
         were measured before anything was observed hold only roughly for what is given here.
 
         Args:
@@ -149,12 +152,14 @@ class Mixture:
         root = torch.linalg.cholesky(precision)
         pull = image @ off
         z = torch.cholesky_solve(pull, root)
-        # A Student distribution in place of the normal one: an odd beginning makes what follows less sure, not another
-        # future certain. It has as many dimensions as samples tell weights apart from noise.
+        # Errors are Student distributed: an odd beginning makes what follows less sure, not another future certain.
+        # Samples tell weights apart from noise in so many dimensions:
         size = len(basis) - torch.cholesky_inverse(root).diagonal(dim1=-2, dim2=-1).sum(dim=-1)
         distance = off.square().sum(dim=(-2, -1)) - (pull * z).sum(dim=(-2, -1))
-        heavy = (FREEDOM + size) / 2 * torch.log1p(distance / FREEDOM)
-        evidence = -heavy - root.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        # Bayes' rule would name the future that is narrowest about the beginning. That is a lift, until an object
+        # slips: slips differ from each other. So a beginning speaks only against futures that it is far from.
+        beyond = (distance / DOUBT**2 - size).clamp(min=0) / (FREEDOM + size)
+        evidence = -(FREEDOM + size) / 2 * torch.log1p(beyond)
         wider = ((FREEDOM + distance) / (FREEDOM + size)).sqrt()
         odds = (self.odds + evidence.to(self.odds)).flatten(1).log_softmax(dim=1).view_as(self.odds)
         mean = self.mean + (factor @ z)[..., 0].to(self.mean)
