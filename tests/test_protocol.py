@@ -209,7 +209,9 @@ def test_the_plan_is_the_papers():
     }
     per_seed |= {"training-size": 72, "steps-ahead": 44, "novel-corners": 48, "ablation": 4}
     assert Counter(t.experiment for t in trials) == {name: 10 * count for name, count in per_seed.items()}
-    assert {t.features for t in trials if t.experiment == "features"} == set(FEATURES) - {"outline"} | {"one-shot"}
+    assert {t.features for t in trials if t.experiment == "features"} == set(FEATURES) - {"outline"} | {
+        "one-shot"
+    }
     for name in EXPERIMENTS:
         seeds = [t.seed for t in trials if t.experiment == name]
         assert seeds == sorted(seeds)

@@ -14,15 +14,16 @@ if TYPE_CHECKING:
 def evaluate_predictor(
     run: Positional[Path],
     data: Path,
-    part: Literal["train", "validation", "test"] = "test",
+    part: Literal["train", "validation", "test", "all"] = "test",
     out: Path | None = None,
 ) -> None:
     """Errors of a predictor as the paper defines them: over the full trajectory and at its end, in cm.
 
     Args:
         run: Folder of the training.
-        data: Folder of the data set that it was trained on.
-        part: Which part of the training's split to judge by.
+        data: Folder of the data set that it was trained on, or of any other with --part all.
+        part: Which part of the training's split to judge by; all: every interaction of the data set, as of one that the
+            training never saw, such as imported recordings.
         out: CSV file to write the rows to.
     """
     import pandas as pd
@@ -31,8 +32,10 @@ def evaluate_predictor(
     from foretrace.interactions.dataset import Dataset
     from foretrace.predictor import load_predictor, part_of
 
-    rows = experiments.evaluate_predictor(load_predictor(run), part_of(run, Dataset.open(data), part))
-    print_errors(rows, f"{run}, {part} part of {data}")
+    dataset = Dataset.open(data)
+    batch = dataset.batch() if part == "all" else part_of(run, dataset, part)
+    rows = experiments.evaluate_predictor(load_predictor(run), batch)
+    print_errors(rows, f"{run}, all of {data}" if part == "all" else f"{run}, {part} part of {data}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(rows).to_csv(out, index=False, float_format="%.5f")
