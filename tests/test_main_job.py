@@ -66,6 +66,16 @@ def test_evaluate_prints_and_writes_the_paper_errors(
     assert overall["count"].iloc[0] == len(json.loads((run / "split.json").read_text())["test"])
 
 
+def test_evaluate_judges_by_data_that_the_training_never_saw(run: Path, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "errors.csv"
+    assert (
+        cli.main(["evaluate", "predictor", str(run), "--data", str(data), "--part", "all", "--out", str(out)])
+        == 0
+    )
+    rows = pd.read_csv(out)
+    assert rows.loc[rows["group"] == "all", "count"].iloc[0] == 52
+
+
 def test_describe_writes_figures(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "figures.json"
     assert cli.main(["describe", str(data), "--out", str(out)]) == 0
