@@ -15,6 +15,8 @@ import trimesh
 from PIL import Image
 
 from foretrace import cli
+from foretrace.evaluation.experiments import at_times
+from foretrace.predictor import ImaginedBatch
 
 ROOT = Path(__file__).parents[1]
 
@@ -74,6 +76,16 @@ def test_evaluate_judges_by_data_that_the_training_never_saw(run: Path, data: Pa
     )
     rows = pd.read_csv(out)
     assert rows.loc[rows["group"] == "all", "count"].iloc[0] == 52
+
+
+def test_imagined_paths_are_compared_at_the_times_of_the_data() -> None:
+    times = np.linspace(0, 1, 11)
+    imagined = ImaginedBatch(times, np.repeat((times**2)[None, :, None], 3, axis=2))
+    np.testing.assert_array_equal(at_times(imagined, times), imagined.com)
+    np.testing.assert_array_equal(at_times(imagined, times[:5]), imagined.com[:, :5])
+    between = at_times(imagined, np.array([0.05, 0.1, 1.0, 1.1]))
+    np.testing.assert_allclose(between[0, :3, 0], [0.005, 0.01, 1.0])
+    assert np.isnan(between[0, 3]).all()
 
 
 def test_describe_writes_figures(data: Path, tmp_path: Path) -> None:

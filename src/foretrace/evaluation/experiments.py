@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import EffectPredictor
-from foretrace.predictor.base import Start
+from foretrace.predictor.base import ImaginedBatch, Start
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance, rotation_error
 
@@ -34,13 +34,25 @@ def evaluate_predictor(predictor: EffectPredictor, batch: InteractionBatch) -> l
     truth = np.where(valid_samples(batch)[..., None], batch.com, np.nan)
     rows = []
     for start in STARTS:
-        imagined = predictor.imagine_batch(batch, start).com
+        imagined = at_times(predictor.imagine_batch(batch, start), batch.times)
         for metric, distance in METRICS.items():
             errors = 100 * np.asarray(distance(imagined, truth))
             for group, value, chosen in _groups(batch):
                 row = {"group": group, "value": value, "metric": metric, "start": start}
                 rows.append(row | _summary(errors[chosen]))
     return rows
+
+
+def at_times(imagined: ImaginedBatch, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "batch time 3"]:
+    """Imagined centres of mass at other times, as of recordings [m]: between samples on a straight line, NaN past them."""
+    if len(times) == len(imagined.times) and np.allclose(times, imagined.times, rtol=0, atol=1e-9):
+        return imagined.com
+    last = len(imagined.times) - 1
+    places = np.clip(np.interp(times, imagined.times, np.arange(last + 1)), 0, last)
+    before = np.minimum(places.astype(int), last - 1)
+    share = (places - before)[:, None]
+    found = (1 - share) * imagined.com[:, before] + share * imagined.com[:, before + 1]
+    return np.where((times <= imagined.times[-1] + 1e-9)[:, None], found, np.nan)
 
 
 def pose_errors(
