@@ -44,7 +44,7 @@ def evaluate_predictor(predictor: EffectPredictor, batch: InteractionBatch) -> l
 
 
 def at_times(imagined: ImaginedBatch, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "batch time 3"]:
-    """Imagined centres of mass at other times, as of recordings [m]: between samples on a straight line, NaN past them."""
+    """Imagined centres of mass at the times of a recording [m]: on straight lines between samples, NaN past them."""
     if len(times) == len(imagined.times) and np.allclose(times, imagined.times, rtol=0, atol=1e-9):
         return imagined.com
     last = len(imagined.times) - 1
