@@ -186,6 +186,14 @@ def test_the_shipped_predictor_tells_what_becomes_of_a_box(edge: int, outcome: s
     assert (SHIPPED / "MODEL_CARD.md").read_text().startswith("# Model card")
 
 
+def rows_of(card: str, section: str) -> list[list[str]]:
+    """Cells of the table in a section."""
+    text = card.split(f"## {section}\n")[1].split("\n## ")[0]
+    return [
+        [c.strip() for c in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")
+    ][2:]
+
+
 def test_the_card_counts_the_data(card: str, run: Path) -> None:
     rows = rows_of(card, "Data")
     parts = json.loads((run / "split.json").read_text())
