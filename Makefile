@@ -21,7 +21,8 @@ demo: setup
 	$(BIN)/foretrace demo --out demo
 
 test: setup
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --ignore tests/test_realsense.py
+	$(BIN)/python -m pytest tests/test_realsense.py  # its library has died once beside other tests
 
 check: setup
 	$(BIN)/ruff format --check .

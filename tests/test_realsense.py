@@ -58,11 +58,13 @@ def record(path: Path, depth: bool = True, colour: bool = True, model: str = "br
     for outlet in outlets:
         outlet.open(outlet.get_stream_profiles())
         outlet.start(queue)
+    kept = []  # the library reads pixels in threads of its own
     for number in range(FRAMES):
         steps = np.full((HEIGHT, WIDTH), 500 + number, np.uint16)
         for name, size, pixels in (("Depth", 2, steps), ("Color", 3, colour_of(number))):
             if name not in sensors:
                 continue
+            kept.append(pixels)
             frame = rs.software_video_frame()
             frame.pixels, frame.stride, frame.bpp, frame.frame_number = pixels, size * WIDTH, size, number
             frame.timestamp = START + 1000 / 30 * number
