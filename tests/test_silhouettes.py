@@ -59,7 +59,9 @@ def test_corners_survive_the_way_through_a_mask(seed, num_corners, metres_per_pi
     # Usually a tenth of a pixel, in 99 of 100 polygons below 0.4; very sharp and very blunt corners are the hard ones.
     assert np.median(apart.min(axis=0)) < metres_per_pixel
     assert shapely.hausdorff_distance(shapely.LinearRing(prism.corners), shapely.LinearRing(outline)) < 0.003
-    assert polygon_area(prism.corners) == pytest.approx(polygon_area(outline), rel=0.01)
+    # The outline may be left by a millimetre; on average, to either side, it is by far less than half of that.
+    allowed = 0.0005 * shapely.LinearRing(outline).length
+    assert polygon_area(prism.corners) == pytest.approx(polygon_area(outline), abs=allowed)
 
 
 def test_tolerance_decides_the_corner_count():
