@@ -172,7 +172,9 @@ def errors_figure(summary: Mapping[str, Any]) -> Figure:
             Line2D([], [], color=INK, marker="D", linestyle="none", label="paper, its own objects")
         )
         fig.legend(handles=handles, loc="outside lower center", ncols=3)
-        note = "The same predictor and lever-ups; means over the seeds, with 95 % bootstrap intervals if several"
+        note = (
+            "The same predictor and lever-ups; means over the seeds, with 95 % bootstrap intervals if several"
+        )
         finish(fig, "What the height map adds to the mask", note)
     return fig
 
