@@ -194,9 +194,9 @@ class Mixture:
 
     def spread(self) -> Float[Tensor, "batch futures time"]:
         """Root mean square of the distance from each future's positions [m]."""
-        displaced = self.motions[..., :3].flatten(1)  # (motions, time 3)
-        images = (self.root.mT @ displaced).unflatten(-1, (-1, 3))
-        return (self.error[..., None] * images.square().sum(dim=(-3, -1)).sqrt()).flatten(1, 2)
+        displaced = self.motions[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, motions)
+        images = (displaced @ self.root).unflatten(-2, (-1, 3)).flatten(-2)
+        return (self.error[..., None] * images.norm(dim=-1)).flatten(1, 2)
 
     def _factor(self) -> Float[Tensor, "batch hinges outcomes motions motions"]:
         return self.error[..., None, None] * self.root

@@ -27,6 +27,11 @@ PROBES = 5
 """Heights are read at this many places along either side of the rectangle about the hull."""
 MIRROR = (1.0, -1.0, 1.0)
 """A vector seen in a mirror along the action axis."""
+IN_MIRROR = [0, 1, 2, 4, 3, 5, 7, 6, 8, 9, 11, 10, 12, 13, 15, 14, 17, 16, 18]
+"""Which of the numbers that describe a lever-up each of them is in the mirror, but for its sign."""
+SIGN_IN_MIRROR = torch.ones(NUM_VALUES)
+"""Its sign: positions along the hinge are counted the other way."""
+SIGN_IN_MIRROR[[2, 3, 4, 5, 8, 10, 11, 13, 18]] = -1
 
 
 @dataclass(frozen=True)
@@ -66,35 +71,19 @@ def find_hinges(
     lift = torch.stack([torch.full_like(com[:, 1], -SETBACK), HALF_WIDTH * com[:, 1].sign()], dim=1)
     ray = F.normalize(com[:, :2] - lift, dim=1)
     hull = _Hull(corners)
-    edges = hull.crossed(lift, ray, num_hinges)  # (batch, hinges)
-    images = (-edges - 1) % hull.count[:, None]
-    mirror = com.new_tensor(MIRROR)
-
-    def both(here: Tensor, there: Tensor) -> Tensor:
-        return torch.stack([here, there], dim=1).flatten(0, 1)  # (batch views, ...)
-
-    seen = _see(
-        _Hull(both(corners, _mirrored(corners, hull.count))),
-        both(edges, images),
-        both(com, com * mirror),
-        both(lift, lift * mirror[:2]),
-        both(ray, ray * mirror[:2]),
-    )
-    values, axes, ends = (part.unflatten(0, (-1, 2)) for part in seen)
-    axes = torch.stack([axes[:, 0], axes[:, 1] * mirror], dim=1)
+    values, axes, ends = _see(hull, hull.crossed(lift, ray, num_hinges), com, lift, ray)
+    values = torch.stack([values, values[..., IN_MIRROR] * SIGN_IN_MIRROR.to(values)], dim=1)
     if heights is not None:
-        values = torch.cat([values, _probe(heights, corners, axes, ends[:, 0])], dim=-1)
-    return Hinges(values, axes, ends[:, 0])
+        probed = _probe(heights, corners, axes)
+        values = torch.cat([values, torch.stack([probed, probed.flip(-1)], dim=1).flatten(3)], dim=-1)
+    # What goes out of the object or up does so in the mirror, too; along the edge it is the other way round.
+    return Hinges(values, torch.stack([axes, axes * axes.new_tensor(MIRROR)[:, None]], dim=1), ends)
 
 
 def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "batch corners 2"]:
     """The hulls of `find_hinges` seen in a mirror along the action axis, counter-clockwise again."""
-    return _mirrored(corners, _Hull(corners).count)
-
-
-def _mirrored(corners: Tensor, count: Int[Tensor, " batch"]) -> Tensor:
-    number = torch.arange(corners.shape[1], device=corners.device)
-    order = torch.where(number < count[:, None], -number % count[:, None], 0)
+    number, count = torch.arange(corners.shape[1], device=corners.device), _Hull(corners).count[:, None]
+    order = torch.where(number < count, -number % count, 0)
     return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor(MIRROR[:2])
 
 
@@ -133,7 +122,9 @@ class _Hull:
         """Where the edge nearest to the contact point starts and ends, measured along it from there (batch, 1)."""
         share = (-(self.start * self.side).sum(dim=2) / self.length.clamp(min=1e-6) ** 2).clamp(0, 1)
         distance = (self.start + share[..., None] * self.side).norm(dim=2).masked_fill(~self.there, torch.inf)
-        start, along, length = self.edges(distance.argmin(dim=1, keepdim=True))
+        # A corner is nearest on two edges: of these, it is the one that leads less ahead, in the mirror, too.
+        nearest = (distance + 1e-5 * self.side[..., 0].abs()).argmin(dim=1, keepdim=True)
+        start, along, length = self.edges(nearest)
         first = (start * along).sum(dim=2)
         return first, first + length
 
@@ -190,21 +181,20 @@ def _see(
 def _probe(
     heights: Float[Tensor, "batch rows columns"],
     corners: Float[Tensor, "batch corners 2"],
-    axes: Float[Tensor, "batch views hinges 3 3"],
-    ends: Float[Tensor, "batch hinges 2 2"],
-) -> Float[Tensor, "batch views hinges probes"]:
+    axes: Float[Tensor, "batch hinges 3 3"],
+) -> Float[Tensor, "batch hinges out along"]:
     """Heights on a grid over the rectangle about the hull with sides along the hinge, of unit scale."""
     sides = axes[..., :2, :2]  # rows: out of the object, along the edge
-    reach = corners[:, None, None] @ sides.mT  # (batch, views, hinges, corners, 2)
+    reach = corners[:, None] @ sides.mT  # (batch, hinges, corners, 2)
     low, high = reach.amin(dim=-2), reach.amax(dim=-2)
     share = (torch.arange(PROBES, dtype=low.dtype, device=low.device) + 0.5) / PROBES
     grid = torch.stack(torch.meshgrid(share, share, indexing="ij"), dim=-1).flatten(0, 1)
     points = (low[..., None, :] + (high - low)[..., None, :] * grid) @ sides
     # Positions in the picture, from -1 to 1 between its borders; columns first.
     pixels = points.new_tensor(CONTACT_PIXEL) - points / METRES_PER_PIXEL
-    places = ((2 * pixels + 1) / VIEW_SIZE - 1).flip(-1).flatten(1, 2)
+    places = ((2 * pixels + 1) / VIEW_SIZE - 1).flip(-1)
     found = F.grid_sample(heights[:, None], places, align_corners=False)
-    return found[:, 0].unflatten(1, axes.shape[1:3]) / UNIT
+    return found[:, 0].unflatten(-1, (PROBES, PROBES)) / UNIT
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
