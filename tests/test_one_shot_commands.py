@@ -77,7 +77,7 @@ def imagined_effect(probability=(0.7, 0.25, 0.045, 0.005)) -> ImaginedEffect:
     ends = np.broadcast_to([[0.1, -0.05], [0.1, 0.04]], (1, n, 2, 2))
     pose = np.concatenate([com, np.broadcast_to([1.0, 0, 0, 0], (1, n, 5, 4))], axis=-1)
     futures = Futures(
-        np.array([probability]), ("levered", "slipped") * (n // 2), com, pose,
+        np.array([probability]), ("levered", "slipped") * (n // 2), np.concatenate([com, 0 * com], axis=-1),
         np.broadcast_to(spread, (1, n, 5)), ends, 2 * np.ones(len(LEVELS)),
     )  # fmt: skip
     return ImaginedEffect(times, com[0, 0], pose[0, 0], futures, ("height 9 cm is unusual",))

@@ -48,17 +48,16 @@ def told(part: Part, *com: np.ndarray, probability: tuple[float, ...], spread: f
     """Futures with these positions, turned as it happened; the outcomes by turns levered and slipped."""
     n, shape = len(part), (len(part), len(com))
     positions = np.stack(com, axis=1)
-    poses = np.concatenate([positions, np.stack([decode_poses(part.states)[..., 3:]] * len(com), 1)], axis=-1)
+    states = np.concatenate([positions, np.stack([part.states[..., 3:]] * len(com), 1)], axis=-1)
     futures = Futures(
         probability=np.tile(probability, (n, 1)).astype(float),
         outcome=tuple(("levered", "slipped")[k % 2] for k in range(len(com))),
-        com=positions,
-        pose=poses,
+        states=states,
         spread=np.full((*shape, positions.shape[2]), spread),
         support_points=np.zeros((*shape, 2, 2)),
         quantiles=LEVELS,
     )
-    return ImaginedBatch(part.batch.times, positions[:, 0], poses[:, 0], futures)
+    return ImaginedBatch(part.batch.times, positions[:, 0], decode_poses(states[:, 0]), futures)
 
 
 def test_outcomes_by_hand():

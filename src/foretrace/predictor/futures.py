@@ -1,11 +1,15 @@
 """What may happen: several futures, each with its probability and how far the motion may be from it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
+
+from foretrace.predictor.states import decode_poses
 
 LEVELS = np.arange(1, 100) / 100
 """Probabilities of the regions whose widths a predictor keeps."""
@@ -33,10 +37,8 @@ class Futures:
     """Of each; they sum up to 1."""
     outcome: tuple[str, ...]
     """What becomes of the object in each."""
-    com: Float[np.ndarray, "batch futures time 3"]
-    """Centres of mass in the action frame [m]."""
-    pose: Float[np.ndarray, "batch futures time 7"]
-    """As ``ImaginedEffect.pose_trajectory``."""
+    states: Float[np.ndarray, "batch futures time 6"]
+    """Positions of the centre of mass in the action frame [m] and rotation vectors since rest [rad]."""
     spread: Float[np.ndarray, "batch futures time"]
     """Expected distance of the centre of mass from it (root mean square) [m]."""
     support_points: Float[np.ndarray, "batch futures 2 2"]
@@ -48,8 +50,18 @@ class Futures:
         return len(self.probability)
 
     def __getitem__(self, rows: slice | np.ndarray) -> "Futures":
-        names = ("probability", "com", "pose", "spread", "support_points")
+        names = ("probability", "states", "spread", "support_points")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    @property
+    def com(self) -> Float[np.ndarray, "batch futures time 3"]:
+        """Centres of mass in the action frame [m]."""
+        return self.states[..., :3]
+
+    @cached_property
+    def pose(self) -> Float[np.ndarray, "batch futures time 7"]:
+        """As ``ImaginedEffect.pose_trajectory``; worked out when it is asked for."""
+        return decode_poses(self.states)
 
     @property
     def counted(self) -> np.ndarray:
@@ -173,15 +185,12 @@ class Mixture:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
         rows = torch.arange(len(self.com), device=self.com.device)
         best = self.odds.flatten(1).argmax(dim=1)
-        hinge = best // self.odds.shape[2]
-        return self._states(self.mean.flatten(1, 2)[rows, best][:, None], self.axes[rows, hinge][:, None])[
-            :, 0
-        ]
+        weights, axes = self.mean.flatten(1, 2)[rows, best], self.axes[rows, best // self.odds.shape[2]]
+        return self._states(weights[:, None, None], axes[:, None])[:, 0]
 
     def states(self) -> Float[Tensor, "batch futures time 6"]:
         """Positions [m] and rotation vectors [rad] of all futures."""
-        axes = self.axes[:, :, None].expand(*self.odds.shape, 3, 3)
-        return self._states(self.mean.flatten(1, 2), axes.flatten(1, 2))
+        return self._states(self.mean, self.axes)
 
     def sample(self, num: int, generator: torch.Generator | None = None) -> Float[Tensor, "batch num time 6"]:
         """Positions [m] and rotation vectors [rad] drawn at random."""
@@ -190,7 +199,7 @@ class Mixture:
         z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
         factor = self._factor().flatten(1, 2)[rows, chosen]
         weights = self.mean.flatten(1, 2)[rows, chosen] + (factor @ z[..., None].to(factor))[..., 0]
-        return self._states(weights, self.axes[rows, chosen // self.odds.shape[2]])
+        return self._states(weights[:, :, None], self.axes[rows, chosen // self.odds.shape[2]])
 
     def spread(self) -> Float[Tensor, "batch futures time"]:
         """Root mean square of the distance from each future's positions [m]."""
@@ -201,11 +210,22 @@ class Mixture:
     def _factor(self) -> Float[Tensor, "batch hinges outcomes motions motions"]:
         return self.error[..., None, None] * self.root
 
-    def _states(self, weights: Tensor, axes: Float[Tensor, "batch futures 3 3"]) -> Tensor:
-        motion = (weights @ self.motions.flatten(1)).unflatten(-1, self.mean_motion.shape) + self.mean_motion
-        moved, turned = (part @ axes for part in motion.split(3, dim=-1))
-        states = torch.cat([self.com[:, None, None] + moved, turned / TURN_LENGTH], dim=-1)
-        k = self.observed.shape[1]
+    def _states(
+        self,
+        weights: Float[Tensor, "batch hinges futures motions"],
+        axes: Float[Tensor, "batch hinges 3 3"],
+    ) -> Float[Tensor, "batch hinges*futures time 6"]:
+        shape = (*weights.shape[:3], 2, 3)  # displacements and turns
+        motion = torch.addmm(self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.motions.mT.flatten(1))
+        back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)
+        rest = F.pad(self.com, (0, 3)).unflatten(1, (2, 3))[:, None, None].expand(shape)
+        # One product with time last: memory is gone through once, in long rows.
+        states = torch.baddbmm(
+            rest.flatten(0, 3)[..., None], back.flatten(0, 3), motion.unflatten(1, (2, 3, -1)).flatten(0, 1)
+        )
+        states = states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
+        if not (k := self.observed.shape[1]):
+            return states
         seen = self.observed[:, None].expand(-1, states.shape[1], -1, -1)
         return torch.cat([seen, states[:, :, k:]], dim=2)
 

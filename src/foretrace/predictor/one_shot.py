@@ -305,16 +305,14 @@ class OneShotPredictor(EffectPredictor):
         observed: Float[np.ndarray, "batch samples state"] | None = None,
     ) -> ImaginedBatch:
         """As the base class; with all futures."""
-        with torch.no_grad():
+        with torch.inference_mode():
             start = torch.as_tensor(com, dtype=torch.float32, device=self.device)
             mixture = self.mixture(features, start)
             if observed is not None:
                 mixture = mixture.given(torch.as_tensor(observed, dtype=torch.float32, device=self.device))
             futures = self._futures(mixture)
-        rows, best = np.arange(len(com)), futures.probability.argmax(axis=1)
-        return ImaginedBatch(
-            self.times.cpu().numpy(), futures.com[rows, best], futures.pose[rows, best], futures
-        )
+        best = futures.states[np.arange(len(com)), futures.probability.argmax(axis=1)].astype(float)
+        return ImaginedBatch(self.times.cpu().numpy(), best[..., :3], decode_poses(best), futures)
 
     def imagine_contacts(
         self,
@@ -416,13 +414,11 @@ class OneShotPredictor(EffectPredictor):
         )
 
     def _futures(self, mixture: Mixture) -> Futures:
-        states = mixture.states().double().cpu().numpy()
         ends = mixture.ends[:, :, None].expand(*mixture.odds.shape, 2, 2).flatten(1, 2)
         return Futures(
             probability=mixture.odds.flatten(1).exp().double().cpu().numpy(),
             outcome=self.outcomes * self.settings.hinges,
-            com=states[..., :3],
-            pose=decode_poses(states),
+            states=mixture.states().cpu().numpy(),
             spread=mixture.spread().double().cpu().numpy(),
             support_points=ends.double().cpu().numpy(),
             quantiles=self.quantiles.double().cpu().numpy(),
@@ -468,11 +464,10 @@ def _moved_maps(
     maps: Float[Tensor, "n 1 rows columns"], axes: Float[Tensor, "n 2 2"], origins: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n rows columns"]:
     """Maps over a whole view as seen from other frames, of which the axes and origins in the view's are given [m]."""
-    cell = VIEW_SIZE / maps.shape[-1]
-    middle = (torch.arange(maps.shape[-1]).to(maps) + 0.5) * cell - 0.5
-    pixels = torch.stack(torch.meshgrid(middle, middle, indexing="ij"), dim=-1).flatten(0, 1)
-    contact = maps.new_tensor(CONTACT_PIXEL)
-    points = (contact - pixels) * METRES_PER_PIXEL @ axes + origins[:, None]
-    places = ((2 * (contact - points / METRES_PER_PIXEL) + 1) / VIEW_SIZE - 1).flip(-1)
-    found = F.grid_sample(maps, places.unflatten(1, maps.shape[-2:]), align_corners=False)
-    return found[:, 0]
+    contact = (
+        2 * maps.new_tensor(CONTACT_PIXEL) + 1
+    ) / VIEW_SIZE - 1  # in units of half a view from its middle
+    origins = contact - contact @ axes - origins / (VIEW_SIZE * METRES_PER_PIXEL / 2)
+    moves = torch.cat([axes.mT.flip(1, 2), origins.flip(1)[..., None]], dim=2)  # columns first
+    places = F.affine_grid(moves, list(maps.shape), align_corners=False)
+    return F.grid_sample(maps, places, align_corners=False)[:, 0]
