@@ -41,16 +41,20 @@ def polygon_centroid(corners: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"
 
 def convex_hull(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
     """Corners of the convex hull, counter-clockwise, collinear points left out (monotone chain)."""
-    ordered = np.unique(points, axis=0)
+    ordered = sorted(set(map(tuple, points.tolist())))
     if len(ordered) < 3:
-        return ordered
+        return np.array(ordered).reshape(-1, 2)
 
-    def chain(sequence: np.ndarray) -> list[np.ndarray]:
-        kept: list[np.ndarray] = []
-        for point in sequence:
-            while len(kept) >= 2 and cross(kept[-1] - kept[-2], point - kept[-2]) <= 0:
+    # Plain numbers: arrays of two would take twenty times as long.
+    def chain(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        kept: list[tuple[float, float]] = []
+        for x, y in sequence:
+            while len(kept) >= 2:
+                (ax, ay), (bx, by) = kept[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
                 kept.pop()
-            kept.append(point)
+            kept.append((x, y))
         return kept[:-1]
 
     return np.array(chain(ordered) + chain(ordered[::-1]))

@@ -74,7 +74,8 @@ class Outline(FeatureExtractor):
         if not self.heights:
             return corners
         side = batch.height.shape[1] // HEIGHT_CELLS
-        cells = batch.height.reshape(len(batch), HEIGHT_CELLS, side, HEIGHT_CELLS, side).mean(axis=(2, 4))
+        rows = batch.height.reshape(len(batch), HEIGHT_CELLS, side, -1).mean(axis=2)
+        cells = rows.reshape(len(batch), HEIGHT_CELLS, HEIGHT_CELLS, side).mean(axis=3)
         return torch.cat([corners, torch.from_numpy(cells / UNIT).float().flatten(1)], dim=1)
 
     def forward(self, inputs: Float[Tensor, "batch features"]) -> Float[Tensor, "batch features"]:
@@ -122,8 +123,12 @@ def fit_hull(mask: Bool[np.ndarray, "128 128"]) -> Float[np.ndarray, "n 2"]:
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    return mask if count == 2 else labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    pixels = np.ascontiguousarray(mask).view(np.uint8)
+    outlines, _ = cv2.findContours(pixels, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    if len(outlines) == 1:  # one object without holes, as nearly always: labels would take longer to find
+        return mask
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
+    return labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
 
 
 def _metres(corners: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:

@@ -68,10 +68,12 @@ def check_view(view: TopDownView) -> None:
             f"the view has heights up to {height[~mask].max():.4f} m outside the mask: give 0 beside the object, or "
             "a mask of all that has a height"
         )
-    _, _, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
-    sizes = stats[1:, cv2.CC_STAT_AREA]
-    if (count := int((sizes > RELEVANT_SHARE * sizes.max()).sum())) > 1:
-        raise PredictionError(f"the view's mask shows {count} objects: leave one of them")
+    outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    if len(outlines) > 1:  # of several objects, or of holes
+        _, _, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
+        sizes = stats[1:, cv2.CC_STAT_AREA]
+        if (count := int((sizes > RELEVANT_SHARE * sizes.max()).sum())) > 1:
+            raise PredictionError(f"the view's mask shows {count} objects: leave one of them")
     _check_contact(mask)
 
 
