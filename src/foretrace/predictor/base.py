@@ -396,12 +396,12 @@ def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
     Above the centre of each mask's area, at half the object's greatest height: right for a prism of uniform
     density but for its bevel.
     """
-    areas = batch.mask.sum(axis=(1, 2))
+    across, along = batch.mask.sum(axis=2), batch.mask.sum(axis=1)
+    areas = across.sum(axis=1)
     if not areas.all():
         raise PredictionError(
             f"the mask of interaction {batch.ids[np.argmin(areas)]} is empty; nothing can be imagined"
         )
-    rows = (batch.mask.sum(axis=2) * np.arange(batch.mask.shape[1])).sum(axis=1) / areas
-    columns = (batch.mask.sum(axis=1) * np.arange(batch.mask.shape[2])).sum(axis=1) / areas
+    rows, columns = (counts @ np.arange(counts.shape[1]) / areas for counts in (across, along))
     points = (CONTACT_PIXEL - np.stack([rows, columns], axis=-1)) * METRES_PER_PIXEL
     return np.concatenate([points, batch.height.max(axis=(1, 2))[:, None] / 2], axis=-1)
