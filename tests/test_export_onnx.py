@@ -47,7 +47,7 @@ def shake(predictor, seed: int = 0):
             state[name] = 0.05 * torch.arange(len(tensor)).to(tensor)
         else:
             state[name] = (
-                tensor + (0.01 if name.endswith("motions") or name == "mean_motion" else 0.1) * noise
+                tensor + (0.01 if name.endswith("motions") or name == "mean_motion" else 0.2) * noise
             )
     predictor.load_state_dict(state)
     return predictor.eval()

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -10,14 +11,14 @@ from foretrace.actions import sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import make_features
 from foretrace.features.outline import MAX_CORNERS, UNIT
-from foretrace.features.support_points import support_points_by_rule
+from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism
 from foretrace.predictor import OneShotConfig, OneShotPredictor, load_predictor, save_checkpoint
-from foretrace.predictor.futures import along_hinges, quantiles_of
-from foretrace.predictor.hinges import NUM_VALUES, PROBES, find_hinges, mirror_corners
+from foretrace.predictor.futures import FLOOR, LEVELS, Futures, along_hinges, quantiles_of
+from foretrace.predictor.hinges import NUM_VALUES, PROBES, RIM, find_hinges, mirror_corners
 from foretrace.predictor.states import decode_poses, encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error
@@ -65,11 +66,18 @@ def everything(batch) -> Split:
     return Split(rows, rows, rows)
 
 
-def test_the_first_hinge_is_the_rules_support_edge(batch):
+def test_the_ray_through_the_centre_of_mass_leaves_the_bottom_face_at_the_first_hinge(batch):
     hinges = find_hinges(exact_corners(batch), torch.from_numpy(batch.com[:, 0]))
     ends, axes = hinges.ends[:, 0], hinges.axes[:, 0, 0]
-    rule = support_points_by_rule(batch)
-    np.testing.assert_allclose(np.sort(ends, axis=1), np.sort(rule, axis=1), atol=1e-12)
+    for row in range(len(batch)):
+        outline = batch.corners[row, : batch.num_corners[row]]
+        bottom = shapely.Polygon(outline).buffer(-RIM, join_style="mitre", mitre_limit=50)
+        com = batch.com[row, 0, :2]
+        lift = np.array([-SETBACK, HALF_WIDTH * np.sign(com[1])])
+        ray = shapely.LineString([com, com + 0.5 * (com - lift) / np.linalg.norm(com - lift)])
+        left = ray.intersection(bottom.exterior)
+        hinge = shapely.LineString(ends[row].numpy() - RIM * axes[row, 0, :2].numpy())
+        assert shapely.distance(left, hinge) < 1e-9
     product = axes @ axes.mT
     torch.testing.assert_close(product, torch.eye(3, dtype=torch.float64).expand_as(product))
     assert (torch.linalg.det(axes) > 0).all()
@@ -140,7 +148,7 @@ def test_mirror_images_have_mirrored_motions(batch):
 
 
 def test_it_learns_what_it_has_seen(batch):
-    config = replace(QUICK, hidden=64, epochs=60, learning_rate=1e-2)
+    config = replace(QUICK, hidden=64, epochs=150, learning_rate=1e-2)
     predictor, _ = fit_predictor(batch, config, everything(batch))
     imagined = predictor.imagine_batch(batch)
     levered = batch.outcome == "levered"
@@ -226,20 +234,50 @@ def test_scores_in_any_order_give_regions_of_their_level():
     assert np.isinf(quantiles_of(rng.exponential(size=5))[-1])
 
 
-def test_observed_samples_bend_the_rest(batch):
-    predictor, _ = fit_predictor(batch, LONGER, everything(batch))
-    # Motions that may happen by its own account.
-    assert isinstance(predictor, OneShotPredictor)
-    features = predictor.compute_features(predictor.features.inputs(batch))
-    mixture = predictor.mixture(features, torch.from_numpy(batch.com[:, 0]).float())
-    drawn = mixture.sample(1, torch.Generator().manual_seed(0))[:, 0].detach().double().numpy()
-    happened = replace(batch, com=drawn[..., :3], pose=decode_poses(drawn), length=np.full(len(batch), 24))
-    plain, after = predictor.imagine_batch(happened), predictor.imagine_batch(happened, observed=12)
-    np.testing.assert_allclose(after.com[:, :12], happened.com[:, :12], atol=1e-6)
-    errors = [np.asarray(mean_distance(i.com[:, 12:], drawn[:, 12:, :3])).mean() for i in (plain, after)]
-    assert errors[1] < 0.5 * errors[0]
+def some_futures(probability=(0.7, 0.3)) -> Futures:
+    """One interaction with two futures: along x at 1 m/s, and falling from the same line after ten samples."""
+    com = np.zeros((2, 20, 3))
+    com[..., 0] = np.arange(20) * 0.01
+    com[1, 10:, 2] = -0.02 * np.arange(1, 11)
+    states = np.concatenate([com, np.zeros((2, 20, 3))], axis=2)[None]
+    spread = np.broadcast_to(1e-3 * np.sqrt(np.arange(20)), (1, 2, 20))
+    ends = np.zeros((1, 2, 2, 2))
+    return Futures(
+        np.array([probability]), ("levered", "slipped"), states, spread, ends, np.ones(len(LEVELS))
+    )
+
+
+def test_an_object_keeps_its_distance_from_where_it_was_expected():
+    futures = some_futures()
+    happened = futures.states[:, 0] + [0.0, 0.005, 0.0, 0.0, 0.0, 0.1]
+    given = futures.given(happened[:, :8], sample_period=0.05)
+    np.testing.assert_allclose(given.states[:, 0], happened, atol=1e-12)
+    np.testing.assert_array_equal(given.states[:, 1, :8], happened[:, :8])
+    # A future that falls forgets it: a fifth is left after half a second.
+    np.testing.assert_allclose(given.states[0, 1, 17, 1], 0.005 * np.exp(-10 * 0.05 / 0.3), atol=1e-12)
+    # Both fit equally well so far.
+    np.testing.assert_allclose(given.probability, futures.probability, atol=1e-12)
+    assert (given.spread[:, :, :8] == 0).all()
+    # 5 mm where 2.6 were expected: what follows is less sure by the same factor.
+    factor = 0.005 / (futures.spread[0, 0, 7] + FLOOR)
+    np.testing.assert_allclose(given.spread[0, 0, 11], factor * 1e-3 * np.sqrt(11 - 7), rtol=1e-6)
+
+
+def test_a_future_that_the_beginning_leaves_becomes_improbable():
+    futures = some_futures((0.9, 0.1))
+    for fate, other in ((0, 1), (1, 0)):
+        given = futures.given(futures.states[:, fate, :14], sample_period=0.05)
+        assert given.probability[0, fate] > given.probability[0, other]
+        np.testing.assert_allclose(given.states[0, fate], futures.states[0, fate], atol=1e-12)
+    assert given.radius(0.9)[0, 1, -1] < futures.radius(0.9)[0, 1, -1]
+
+
+def test_observed_samples_reach_the_predictor(batch):
+    predictor, _ = fit_predictor(batch, QUICK, everything(batch))
+    after = predictor.imagine_batch(batch, observed=12)
+    np.testing.assert_allclose(after.com[:, :12], batch.com[:, :12], atol=1e-6)
     # One at a time gives the same as a batch.
-    poses = decode_poses(drawn[0, :12])
+    poses = decode_poses(encode_states(batch, "turn", batch.length)[0, :12])
     one = predictor.imagine(TopDownView(batch.mask[0], batch.height[0]), observed=poses)
     np.testing.assert_allclose(one.com_trajectory, after.com[0], atol=1e-5)
 

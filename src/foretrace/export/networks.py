@@ -86,11 +86,9 @@ class Distribution(Network):
     """A one-shot predictor: from outlines to all futures."""
 
     predictor: OneShotPredictor
-    root: Tensor
 
     def __init__(self, predictor: OneShotPredictor):
         super().__init__(predictor)
-        self.register_buffer("root", torch.linalg.cholesky(predictor.covariance))
         heights = f"; then {HEIGHT_CELLS} x {HEIGHT_CELLS} mean heights, row by row" * predictor.heights
         corners = f"x and y of {MAX_CORNERS} corners of the hull, the first one filling the row"
         self.inputs = {
@@ -106,7 +104,7 @@ class Distribution(Network):
 
     def forward(self, features: Tensor, com: Tensor, known: Tensor | None = None) -> tuple[Tensor, ...]:
         """The distribution."""
-        mixture = self.predictor.mixture(self.add_known(features, known), com, self.root)
+        mixture = self.predictor.mixture(self.add_known(features, known), com)
         states = mixture.states()
         ends = mixture.ends[:, :, None].expand(-1, -1, mixture.odds.shape[2], -1, -1).flatten(1, 2)
         return mixture.odds.flatten(1).exp(), states[..., :3], states[..., 3:], mixture.spread(), ends

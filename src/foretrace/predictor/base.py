@@ -97,6 +97,8 @@ class EffectPredictor(nn.Module, ABC):
 
     label: ClassVar[str]
     """Name in PREDICTORS."""
+    keeps_last_epoch: ClassVar[bool] = False
+    """Whether the model of the last epoch is kept, instead of that of the least validation loss."""
     state_mean: Tensor
     state_scale: Tensor
     times: Tensor
@@ -171,10 +173,6 @@ class EffectPredictor(nn.Module, ABC):
         other_effects: Effects,
     ) -> None:
         """Take from training and validation part what is needed after the last step; by default nothing."""
-
-    def validation_loss(self, off: Float[np.ndarray, "samples state"]) -> float:
-        """What the best epoch has least of, from how far imagined normalised states are off: the mean square."""
-        return float(np.mean(off**2))
 
     @abstractmethod
     def roll_out(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from foretrace.interactions.record import Outcome
 from foretrace.predictor.states import decode_poses
 
 LEVELS = np.arange(1, 100) / 100
@@ -17,12 +18,14 @@ MIN_PROBABILITY = 0.05
 """A future less probable than this belongs to no region, unless it is the most probable one."""
 FLOOR = 1e-4
 """Nobody is surer of a position than this [m]: what half the time step changes in simulation is a fifth of it."""
-NOISE = 5e-4
-"""What an observed position may be off [m]; also what principal motions leave out."""
-FREEDOM = 4.0
-"""Degrees of freedom of the Student distribution of errors: the fewer, the heavier its tails."""
-DOUBT = 2.0
-"""A future loses probability where the beginning is farther from it than so many times what was expected."""
+STEADY = 2
+"""An observed motion is compared with a future by the mean of its last so many samples: they are noisy."""
+DRIFT_SAMPLES = 10
+"""Over so many samples before, the distance from a future should not have changed."""
+DRIFT = 2e-3
+"""A change by this makes a future half as probable [m]."""
+FORGET_TIME = 0.3
+"""An object that falls forgets within this time that it was not where it was expected [s]; it lands on the table."""
 COORDINATES = 6
 """A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
 TURN_LENGTH = 0.05
@@ -82,6 +85,39 @@ class Futures:
         wide = float(np.interp(level, LEVELS, self.quantiles))
         return np.where(self.counted[..., None], wide * (self.spread + FLOOR), np.nan)
 
+    def given(self, observed: Float[np.ndarray, "batch samples 6"], sample_period: float) -> "Futures":
+        """What may happen after the first samples were observed.
+
+        An object that is not where it was expected, since the blade met it elsewhere, say, keeps that distance: all
+        that follows is moved and turned by it. What follows a slip forgets it, as it ends on the table. A future from which
+        the distance changes becomes less probable. Expected distances grow from the last observed sample on, as those
+        of a random walk, and more so the further that sample is off. Regions hold only roughly from then on.
+
+        Args:
+            observed: Positions in the action frame [m] and rotation vectors since rest [rad], from the start.
+            sample_period: Seconds between samples.
+        """
+        k = observed.shape[1]
+        off = observed[:, None] - self.states[:, :, :k]  # (batch, futures, k, 6)
+        steady = off[:, :, -STEADY:].mean(axis=2, keepdims=True)
+        drift = np.square(off - steady)[:, :, -DRIFT_SAMPLES:, :3].sum(axis=3).mean(axis=2)
+        odds = np.log(np.maximum(self.probability, 1e-30)) - np.log1p(drift / DRIFT**2)
+        odds = np.exp(odds - odds.max(axis=1, keepdims=True))
+        since = sample_period * np.arange(1, self.states.shape[2] - k + 1)
+        falls = np.array([name == Outcome.SLIPPED for name in self.outcome])
+        kept = np.where(falls[:, None], np.exp(-since / FORGET_TIME), 1.0)[..., None]
+        seen = np.broadcast_to(observed[:, None], off.shape)
+        states = np.concatenate([seen, self.states[:, :, k:] + kept * steady], axis=2)
+        last = self.spread[:, :, k - 1 : k]
+        beyond = np.linalg.norm(steady[..., :3], axis=3) / (last + FLOOR)
+        rest = np.sqrt(np.maximum(self.spread[:, :, k:] ** 2 - last**2, 0.0)) * np.maximum(beyond, 1.0)
+        return replace(
+            self,
+            probability=odds / odds.sum(axis=1, keepdims=True),
+            states=states,
+            spread=np.concatenate([np.zeros_like(self.spread[:, :, :k]), rest], axis=2),
+        )
+
     def outcomes(self) -> dict[str, Float[np.ndarray, " batch"]]:
         """Probability of each outcome."""
         names = dict.fromkeys(self.outcome)
@@ -132,54 +168,12 @@ class Mixture:
     """Expected weights."""
     error: Float[Tensor, "batch hinges outcomes"]
     """How large errors are expected to be."""
-    root: Float[Tensor, "#batch #hinges outcomes motions motions"]
-    """Square roots of the covariances of weights, for errors of 1; the same for all until something is observed."""
+    covariance: Float[Tensor, "outcomes motions motions"]
+    """Of weights, for errors of 1."""
     motions: Float[Tensor, "motions time 6"]
     """Principal motions along a hinge's axes [m]; turns times ``TURN_LENGTH``."""
     mean_motion: Float[Tensor, "time 6"]
     """What they are added to."""
-    observed: Float[Tensor, "batch samples 6"]
-    """Positions [m] and rotation vectors [rad] that were observed."""
-
-    def given(self, observed: Float[Tensor, "batch samples 6"]) -> "Mixture":
-        """The mixture after the first samples were observed.
-
-        Conditional multivariate Student distributions (Roth, 2013, "On the multivariate t distribution"), of which
-        those lose probability that the beginning does not fit. Regions that
-        were measured before anything was observed hold only roughly for what is given here.
-
-        Args:
-            observed: Positions in the action frame [m] and rotation vectors since rest [rad].
-        """
-        k = observed.shape[1]
-        motion = torch.cat([observed[..., :3] - self.com[:, None], TURN_LENGTH * observed[..., 3:]], dim=-1)
-        seen = along_hinges(self.axes, motion)  # (batch, hinges, samples, 6)
-        # What is known exactly and what is hardly known lie orders of magnitude apart: too many for float32.
-        basis, factor = self.motions[:, :k].flatten(1).double(), self._factor().double()
-        off = (seen - self.mean_motion[:k]).double().flatten(2)[:, :, None] - self.mean.double() @ basis
-        # Of unit weights z, of which the motion is a linear image.
-        image = factor.mT @ basis / NOISE
-        off = off[..., None] / NOISE
-        precision = image @ image.mT + torch.eye(image.shape[-2], dtype=image.dtype, device=image.device)
-        root = torch.linalg.cholesky(precision)
-        pull = image @ off
-        z = torch.cholesky_solve(pull, root)
-        # Errors are Student distributed: an odd beginning makes what follows less sure, not another future certain.
-        # Samples tell weights apart from noise in so many dimensions:
-        size = len(basis) - torch.cholesky_inverse(root).diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-        distance = off.square().sum(dim=(-2, -1)) - (pull * z).sum(dim=(-2, -1))
-        # Bayes' rule would name the future that is narrowest about the beginning. That is a lift, until an object
-        # slips: slips differ from each other. So a beginning speaks only against futures that it is far from.
-        beyond = (distance / DOUBT**2 - size).clamp(min=0) / (FREEDOM + size)
-        evidence = -(FREEDOM + size) / 2 * torch.log1p(beyond)
-        wider = ((FREEDOM + distance) / (FREEDOM + size)).sqrt()
-        odds = (self.odds + evidence.to(self.odds)).flatten(1).log_softmax(dim=1).view_as(self.odds)
-        mean = self.mean + (factor @ z)[..., 0].to(self.mean)
-        unit = torch.eye(len(basis), dtype=root.dtype, device=root.device).expand_as(root)
-        inverse = torch.linalg.solve_triangular(root, unit, upper=False) * wider[..., None, None]
-        # (factor inverse^T) (factor inverse^T)^T is the covariance; any square root of it will do.
-        root = (factor @ inverse.mT).to(self.root)
-        return replace(self, odds=odds, mean=mean, error=torch.ones_like(odds), root=root, observed=observed)
 
     def most_probable(self) -> Float[Tensor, "batch time 6"]:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
@@ -197,18 +191,17 @@ class Mixture:
         rows = torch.arange(len(self.com), device=self.com.device)[:, None]
         chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
         z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
-        factor = self._factor().flatten(1, 2)[rows, chosen]
-        weights = self.mean.flatten(1, 2)[rows, chosen] + (factor @ z[..., None].to(factor))[..., 0]
+        root, error = torch.linalg.cholesky(self.covariance), self.error.flatten(1)[rows, chosen]
+        off = error[..., None] * (root[chosen % len(root)] @ z[..., None])[..., 0]
+        weights = self.mean.flatten(1, 2)[rows, chosen] + off
         return self._states(weights[:, :, None], self.axes[rows, chosen // self.odds.shape[2]])
 
     def spread(self) -> Float[Tensor, "batch futures time"]:
         """Root mean square of the distance from each future's positions [m]."""
         displaced = self.motions[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, motions)
-        images = (displaced @ self.root).unflatten(-2, (-1, 3)).flatten(-2)
-        return (self.error[..., None] * images.norm(dim=-1)).flatten(1, 2)
-
-    def _factor(self) -> Float[Tensor, "batch hinges outcomes motions motions"]:
-        return self.error[..., None, None] * self.root
+        variance = ((displaced @ self.covariance) * displaced).sum(dim=-1)
+        at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()  # (outcomes, time)
+        return (self.error[..., None] * at_error_1).flatten(1, 2)
 
     def _states(
         self,
@@ -223,11 +216,7 @@ class Mixture:
         states = torch.baddbmm(
             rest.flatten(0, 3)[..., None], back.flatten(0, 3), motion.unflatten(1, (2, 3, -1)).flatten(0, 1)
         )
-        states = states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
-        if not (k := self.observed.shape[1]):
-            return states
-        seen = self.observed[:, None].expand(-1, states.shape[1], -1, -1)
-        return torch.cat([seen, states[:, :, k:]], dim=2)
+        return states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
 
 
 def along_hinges(
@@ -242,8 +231,3 @@ def along_hinges(
         part.view(len(part), *extra, *part.shape[1:]) @ axes.mT for part in motion.split(3, dim=-1)
     )
     return torch.cat([moved, torch.linalg.det(axes)[..., None, None] * turned], dim=-1)
-
-
-def no_observations(com: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 0 6"]:
-    """What was observed when nothing was."""
-    return com.new_zeros(com.shape[0], 0, COORDINATES)  # not len(com): an export takes that for a constant

@@ -14,24 +14,31 @@ from torch.nn import functional as F
 
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
+from foretrace.objects import BEVEL
 
 UNIT = 0.1
 """Lengths are divided by this to be of unit scale [m]."""
 NEAR_CORNER = 0.01
 """Where the ray leaves the hull is told in more detail this near to a corner [m]."""
+AT_CORNER = 0.003
+"""Where rays leave the bottom face is told in more detail this near to a corner [m]."""
+RIM = BEVEL.width
+"""Objects stand on a bottom face that lies so far inside the outline [m]."""
+SHARPEST = 2.6
+"""Corners that turn by more are taken to turn by this [rad]: those of the bottom face would be far away."""
 OUT_OF_SIGHT = 0.15
 """Positions along an edge are cut off this far from it [m]."""
-NUM_VALUES = 19
+NUM_VALUES = 27
 """Numbers that describe a lever-up as seen from one hinge."""
 PROBES = 5
 """Heights are read at this many places along either side of the rectangle about the hull."""
 MIRROR = (1.0, -1.0, 1.0)
 """A vector seen in a mirror along the action axis."""
-IN_MIRROR = [0, 1, 2, 4, 3, 5, 7, 6, 8, 9, 11, 10, 12, 13, 15, 14, 17, 16, 18]
+IN_MIRROR = [0, 1, 2, 4, 3, 5, 7, 6, 8, 9, 11, 10, 13, 12, 15, 14, 16, 17, 19, 18, 21, 20, 23, 22, 25, 24, 26]
 """Which of the numbers that describe a lever-up each of them is in the mirror, but for its sign."""
 SIGN_IN_MIRROR = torch.ones(NUM_VALUES)
 """Its sign: positions along the hinge are counted the other way."""
-SIGN_IN_MIRROR[[2, 3, 4, 5, 8, 10, 11, 13, 18]] = -1
+SIGN_IN_MIRROR[[2, 3, 4, 5, 8, 10, 11, 17, 26]] = -1
 
 
 @dataclass(frozen=True)
@@ -96,6 +103,8 @@ class _Hull:
         self.length = self.side.norm(dim=2)
         self.there: Bool[Tensor, "batch corners"] = self.length > 1e-6
         self.count: Int[Tensor, " batch"] = self.there.sum(dim=1).clamp(min=1)
+        number = torch.arange(corners.shape[1], device=corners.device)
+        self._next, self._last_one = ((number + by) % self.count[:, None] for by in (1, -1))
 
     def edges(self, edges: Int[Tensor, "batch edges"]) -> tuple[Tensor, Tensor, Tensor]:
         """Start (batch, edges, 2), direction (batch, edges, 2) and length (batch, edges)."""
@@ -106,8 +115,9 @@ class _Hull:
 
     def crossed(self, lift: Tensor, ray: Tensor, num: int) -> Int[Tensor, "batch edges"]:
         """The edge across which a ray leaves (the one furthest along it where there is none), and a neighbour."""
-        right = _cross(ray[:, None], self.start - lift[:, None])
-        left = _cross(ray[:, None], self.start + self.side - lift[:, None])
+        first, last = self.bottom()
+        right = _cross(ray[:, None], first - lift[:, None])
+        left = _cross(ray[:, None], last - lift[:, None])
         leaves = (right < 0) & (left >= 0) & self.there
         ahead = ((self.start + self.side / 2) * ray[:, None]).sum(dim=2)
         edge = (ahead + 10 * leaves).masked_fill(~self.there, -torch.inf).argmax(dim=1, keepdim=True)
@@ -117,6 +127,15 @@ class _Hull:
         from_start, from_end = (side.gather(1, edge).abs() for side in (right, left))
         step = torch.where(from_end < from_start, 1, -1)
         return torch.cat([edge, (edge + step) % self.count[:, None]], dim=1)
+
+    def bottom(self) -> tuple[Tensor, Tensor]:
+        """Where the edges of the bottom face start and end (batch, corners, 2)."""
+        along = self.side / self.length.clamp(min=1e-6)[..., None]
+        turn = _turn(along, along.gather(1, self._next[..., None].expand_as(along)))
+        cut = RIM * torch.tan(turn / 2)[..., None]
+        before = cut.gather(1, self._last_one[..., None])
+        inwards = RIM * torch.stack([-along[..., 1], along[..., 0]], dim=-1)
+        return self.start + inwards + before * along, self.start + self.side + inwards - cut * along
 
     def levered(self) -> tuple[Tensor, Tensor]:
         """Where the edge nearest to the contact point starts and ends, measured along it from there (batch, 1)."""
@@ -141,11 +160,22 @@ def _see(
     def ahead(normal: Tensor, point: Tensor) -> Tensor:
         return (normal * point).sum(dim=-1)
 
+    def crossing(lift: Tensor, ray: Tensor, inside: float) -> Tensor:
+        """Where a ray leaves, along the hinge, if that is moved inwards."""
+        travel = (ahead(out, start) - inside - ahead(out, lift)) / ahead(out, ray).clamp(min=0.02)
+        place = ahead(along, lift) + travel * ahead(along, ray)
+        return place.maximum(first - OUT_OF_SIGHT).minimum(last + OUT_OF_SIGHT)
+
     first, beside = ahead(along, start), ahead(along, mass)
     last = first + length
-    travel = (ahead(out, start) - ahead(out, lift)) / ahead(out, ray).clamp(min=0.02)
-    leaves = ahead(along, lift) + travel * ahead(along, ray)
-    leaves = leaves.maximum(first - OUT_OF_SIGHT).minimum(last + OUT_OF_SIGHT)
+    leaves = crossing(lift, ray, 0.0)
+    # How sharply the hull turns at the hinge's ends: at a blunt corner, its neighbour is nearly the same hinge.
+    turns = [_turn(along_before, along), _turn(along, along_after)]
+    right, left = (RIM * torch.tan(turn / 2) for turn in turns)
+    other = lift * lift.new_tensor(MIRROR[:2])
+    # From both corners of the blade: between these rays, the object stands on a corner alone.
+    below = [crossing(lift, ray, RIM), crossing(other, F.normalize(mass - other, dim=-1), RIM)]
+    apart = [gap for place in below for gap in (place - first - right, last - left - place)]
     lengths = [
         # From contact, and from centre of mass, to the hinge; the centre of mass and the ends along it.
         *(ahead(out, start), ahead(out, start - mass), beside, first, last),
@@ -154,14 +184,15 @@ def _see(
         com[:, 2:].expand_as(length),
         # The edge that the blade goes under.
         *(end.clamp(-OUT_OF_SIGHT, OUT_OF_SIGHT).expand_as(length) for end in hull.levered()),
+        # Where rays leave the bottom face, from its ends.
+        *apart,
     ]
-    # How sharply the hull turns at the hinge's ends: at a blunt corner, its neighbour is nearly the same hinge.
-    turns = [torch.atan2(_cross(a, b), ahead(a, b)) for a, b in ((along_before, along), (along, along_after))]
     values = torch.cat(
         [
             torch.stack(lengths, dim=-1) / UNIT,
             torch.stack([out[..., 0], along[..., 0], *turns], dim=-1),
             torch.tanh(torch.stack([leaves - first, last - leaves], dim=-1) / NEAR_CORNER),
+            torch.tanh(torch.stack(apart, dim=-1) / AT_CORNER),
             com[:, 1:2].sign().expand_as(length)[..., None],
         ],
         dim=-1,
@@ -195,6 +226,11 @@ def _probe(
     places = ((2 * pixels + 1) / VIEW_SIZE - 1).flip(-1)
     found = F.grid_sample(heights[:, None], places, align_corners=False)
     return found[:, 0].unflatten(-1, (PROBES, PROBES)) / UNIT
+
+
+def _turn(before: Tensor, after: Tensor) -> Tensor:
+    """The angle from one direction to the next, counter-clockwise [rad]."""
+    return torch.atan2(_cross(before, after), (before * after).sum(dim=-1)).clamp(max=SHARPEST)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -61,9 +61,9 @@ class Progress:
         """The smallest validation loss so far."""
         return self.history[self.best_epoch - 1]["validation_loss"] if self.best_epoch else float("inf")
 
-    def with_epoch(self, row: Row) -> "Progress":
-        """The progress after another epoch, which is the best if its validation loss is the smallest."""
-        better = row["validation_loss"] < self.best_loss
+    def with_epoch(self, row: Row, keep_last: bool = False) -> "Progress":
+        """The progress after another epoch, which is kept if its validation loss is the smallest, or if all are."""
+        better = keep_last or row["validation_loss"] < self.best_loss
         return replace(
             self, history=[*self.history, row], best_epoch=self.epoch + 1 if better else self.best_epoch
         )
