@@ -14,6 +14,7 @@ from rich.console import Console
 
 import factories
 from foretrace.errors import DatasetError, SimulationError
+from foretrace.geometry import is_convex
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
@@ -23,7 +24,7 @@ from foretrace.objects import Box, Cylinder, Prism
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig
-from foretrace.simulation.recipes import num_corners
+from foretrace.simulation.recipes import num_edges
 
 SMALL = CollectConfig(objects=16)
 """208 trials: three shards."""
@@ -86,7 +87,7 @@ def reference(tmp_path_factory) -> Path:
 def test_the_papers_trials_are_2080():
     config = CollectConfig()
     assert num_trials(config) == 2080
-    counts = [num_corners("paper", k) for k in range(config.objects)]
+    counts = [num_edges("paper", k) for k in range(config.objects)]
     assert [counts.count(n) for n in range(3, 11)] == [20] * 8
     located = [collecting._locate(config, id) for id in range(2080)]
     assert located == [(k, contact) for k in range(160) for contact in range(2 * counts[k])]
@@ -95,7 +96,7 @@ def test_the_papers_trials_are_2080():
 @pytest.mark.parametrize("objects", [1, 3, 8, 13])
 def test_any_number_of_objects_is_spread_over_the_corner_counts(objects):
     config = CollectConfig(objects=objects)
-    counts = [num_corners("paper", k) for k in range(objects)]
+    counts = [num_edges("paper", k) for k in range(objects)]
     assert num_trials(config) == 2 * sum(counts)
     assert max(map(counts.count, counts)) - min(map(counts.count, counts)) <= 1
     obj, _, _ = trial(config, num_trials(config) - 1)
@@ -165,9 +166,9 @@ def test_the_mixed_recipe_takes_turns():
         obj, _, _ = trial(config, located.index((k, 0)))
         kinds.append(type(obj))
         assert located.count((k, 0)) == 1
-        assert sum(index == k for index, _ in located) == 2 * len(obj.corners) == 2 * num_corners("mixed", k)
+        assert sum(index == k for index, _ in located) == 2 * len(obj.corners) == 2 * num_edges("mixed", k)
     assert kinds == [Prism, Prism, Cylinder, Box, Prism] * 8
-    prisms = [num_corners("mixed", k) for k in range(40) if k % 5 < 2]
+    prisms = [num_edges("mixed", k) for k in range(40) if k % 5 < 2]
     assert sorted(prisms) == sorted([*range(3, 11)] * 2)
     fewer = replace(config, objects=11)
     for id in (0, 13, 50, num_trials(fewer) - 1):
@@ -175,13 +176,36 @@ def test_the_mixed_recipe_takes_turns():
         assert trial(fewer, id)[2] == trial(config, id)[2]
 
 
-def test_a_mixed_data_set_is_sound_reproducible_and_resumable(tmp_path):
-    config = CollectConfig(objects=15, recipe="mixed")
+def test_the_everyday_recipe_has_every_family():
+    config = CollectConfig(objects=40, recipe="everyday")
+    located = [collecting._locate(config, id) for id in range(num_trials(config))]
+    objects = [trial(config, located.index((k, 0)))[0] for k in range(40)]
+    for k, obj in enumerate(objects):
+        kind, edges = (Cylinder if k % 10 == 3 else Box if k % 10 == 4 else Prism), num_edges("everyday", k)
+        assert type(obj) is kind
+        assert (edges == len(obj.corners)) == (k % 10 < 6)
+        assert sum(index == k for index, _ in located) == 2 * edges
+    sized = [obj for k, obj in enumerate(objects) if k % 10 < 3]
+    assert [len(obj.corners) for obj in sized] == [*range(3, 11), *range(3, 7)]
+    radii = [np.linalg.norm(obj.corners[0]) for obj in sized]
+    assert min(radii) < 0.06 < 0.09 < max(radii)
+    assert len({obj.height for obj in sized}) == len(sized)
+    convex = {k: is_convex(obj.corners) for k, obj in enumerate(objects)}
+    assert all(convex[k] for k in range(40) if k % 10 < 8)
+    assert sum(convex[k] for k in range(40) if k % 10 == 9) == 0
+    fewer = replace(config, objects=11)
+    for id in (0, 25, num_trials(fewer) - 1):
+        assert trial(fewer, id)[0].to_dict() == trial(config, id)[0].to_dict()
+
+
+@pytest.mark.parametrize("recipe", ["mixed", "everyday"])
+def test_a_mixed_data_set_is_sound_reproducible_and_resumable(tmp_path, recipe):
+    config = CollectConfig(objects=15, recipe=recipe)
     collect(config, tmp_path / "one", workers=1, console=quiet(), simulate=fake_trial)
     folder = tmp_path / "two"
     with pytest.raises(KeyboardInterrupt):
         collect(config, folder, workers=1, console=quiet(), simulate=interrupted_after_a_shard)
-    with pytest.raises(DatasetError, match="begun with recipe = mixed, asked for is recipe = paper"):
+    with pytest.raises(DatasetError, match=f"begun with recipe = {recipe}, asked for is recipe = paper"):
         collect(replace(config, recipe="paper"), folder, workers=1, console=quiet(), simulate=fake_trial)
     collect(config, folder, workers=1, console=quiet(), simulate=fake_trial)
     assert shards_of(folder) == shards_of(tmp_path / "one")

@@ -14,6 +14,8 @@ CORNER_MARGIN = 0.001
 """A contact point snapped to the outline keeps this distance from the corners [m]."""
 CONTACT_TOLERANCE = 0.005
 """A contact may lie this far from the outline, as when it was measured with an error [m]."""
+APPROACH = (0.0035, 0.002, 0.3)
+"""What must be free before a sampled contact: this far to either side, from so near to so far away [m]."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -132,6 +134,29 @@ def sample_contacts(obj: ObjectModel, rng: np.random.Generator, per_edge: int = 
         for edge in range(len(obj.corners))
         for _ in range(per_edge)
     ]
+
+
+def sample_reachable_contacts(obj: ObjectModel, rng: np.random.Generator, count: int) -> list[LeverUp]:
+    """Lever-ups uniformly over the length of an outline, wherever a blade gets there straight from outside.
+
+    For outlines of many short edges, of which each would be too many; and for dents, of which the narrow ones have
+    no room for a blade.
+    """
+    starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
+    lengths = np.linalg.norm(stops - starts, axis=1)
+    outline = shapely.Polygon(obj.corners)
+    side, near, far = APPROACH
+    actions: list[LeverUp] = []
+    while len(actions) < count:
+        action = LeverUp.at_edge(
+            obj,
+            int(rng.choice(len(lengths), p=lengths / lengths.sum())),
+            rng.uniform(np.nextafter(0.0, 1.0), 1.0),
+        )
+        way = [action.contact - distance * action.direction for distance in (near, far)]
+        if not shapely.intersects(outline, shapely.LineString(way).buffer(side, cap_style="flat")):
+            actions.append(action)
+    return actions
 
 
 @dataclass(frozen=True)

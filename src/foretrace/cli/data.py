@@ -21,7 +21,7 @@ def simulate(
     camera: Literal["exact", "rgbd"] = "exact",
     seed: int = 0,
     workers: int | None = None,
-    recipe: Literal["paper", "solids", "mixed"] = "paper",
+    recipe: Literal["paper", "solids", "mixed", "everyday"] = "paper",
     watch_time: float | None = None,
     table_edge: float | None = None,
     randomise: bool = False,
@@ -34,16 +34,17 @@ def simulate(
     Args:
         out: Folder of the data set.
         objects: Number of objects; prisms are spread evenly over 3 to 10 corners.
-        contacts_per_edge: Lever-ups at each edge of each object.
+        contacts_per_edge: Lever-ups at each edge of each object; round outlines have as many as four edges.
         engine: Physics engine.
         embodiment: The whole robot, or the blade alone on the same path (faster).
         camera: How the view from above is made: from geometry, or from a rendered depth image.
         seed: Seed of objects, contact points and simulations.
         workers: Processes; by default one for each core.
         recipe: Which objects. paper: prisms. solids: lying cylinders, boxes and flat prisms, always three with one
-            outline. mixed: prisms and solids.
+            outline. mixed: prisms and solids. everyday: the same with prisms of many sizes, and flat objects with
+            round, organic and dented outlines.
         watch_time: Seconds to go on watching after the blade has stopped; by default 0 for the paper's prisms,
-            and 1.5 for solids, which may roll.
+            and 1.5 otherwise, since solids may roll.
         table_edge: Distance of the table's edge ahead of the contact point, in metres: objects can fall off. By
             default no edge is within reach.
         randomise: Draw friction, density, thickness and bevel anew for every lever-up, and let the blade err in

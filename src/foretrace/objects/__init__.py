@@ -3,6 +3,13 @@
 from typing import Any
 
 from foretrace.errors import ShapeError
+from foretrace.objects.flat import (
+    sample_dented,
+    sample_organic,
+    sample_oval,
+    sample_rounded,
+    sample_sized_prism,
+)
 from foretrace.objects.mesh import MeshObject
 from foretrace.objects.model import (
     BEVEL,
@@ -46,8 +53,13 @@ __all__ = [
     "read_silhouette",
     "sample_box",
     "sample_cylinder",
+    "sample_dented",
     "sample_look_alikes",
+    "sample_organic",
+    "sample_oval",
     "sample_prism",
+    "sample_rounded",
+    "sample_sized_prism",
     "silhouette_origin",
 ]
 

@@ -1,6 +1,7 @@
 """Many lever-ups into one data set: in parallel, reproducibly, and so that no crash destroys what is done.
 
-Every object is levered at two points of each edge (paper, section 4); a recipe says which objects. Trial ``id`` of a
+Every object is levered at two points of each edge (paper, section 4), or of what counts as one; a recipe says which
+objects. Trial ``id`` of a
 configuration is always the same object, action and seed, whoever simulates it and in whatever order.
 """
 
@@ -53,7 +54,7 @@ class CollectConfig:
     objects: int = 160
     """Number of objects; the paper has 160, spread evenly over 3 to 10 corners."""
     contacts_per_edge: int = 2
-    """Lever-ups at each edge of each object."""
+    """Lever-ups at each edge of each object; round outlines have as many as four edges."""
     seed: int = 0
     """Seed of the objects, the contact points and the simulations."""
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
