@@ -95,6 +95,15 @@ def test_same_shadow(tmp_path: Path) -> None:
     assert Image.open(tmp_path / "figure.png").width > 1500
 
 
+def test_everyday_objects(tmp_path: Path) -> None:
+    run_python(EXAMPLES / "everyday_objects.py", picture := tmp_path / "figure.png")
+    drawn = np.asarray(Image.open(picture).convert("RGB"))
+    assert drawn.shape[1] > 1000
+    blue, orange = ((drawn == colour).all(axis=-1).mean() for colour in ([207, 227, 241], [213, 94, 0]))
+    assert 0.05 < blue < 0.5
+    assert 0.005 < orange < 0.05
+
+
 def test_render_scene(tmp_path: Path) -> None:
     obj = paper_objects(0, 1)[0]
     try:

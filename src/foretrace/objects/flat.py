@@ -77,15 +77,17 @@ def sample_dented(rng: np.random.Generator) -> Prism:
 
     def draw() -> shapely.Geometry:
         half = rng.uniform(*HALF_LENGTHS)
-        whole = _superellipse(half, rng.uniform(0.5, 1.0), rng.uniform(1.8, 4.0))
+        whole: shapely.Geometry = _superellipse(half, rng.uniform(0.5, 1.0), rng.uniform(1.8, 4.0))
         for _ in range(rng.integers(1, 3)):
-            rim = whole.exterior.interpolate(rng.random(), normalized=True)
+            rim = shapely.line_interpolate_point(shapely.boundary(whole), rng.random(), normalized=True)
+            at = shapely.get_coordinates(rim)[0]
             size = half * rng.uniform(0.15, 0.5)
-            outward = np.array(rim.coords[0]) / np.linalg.norm(rim.coords[0])
-            middle = np.array(rim.coords[0]) + size * rng.uniform(0.0, 0.8) * outward
-            whole = whole.difference(shapely.Point(middle).buffer(size, 90))
+            middle = at + size * rng.uniform(0.0, 0.8) * at / np.linalg.norm(at)
+            whole = shapely.difference(whole, shapely.Point(middle).buffer(size, 90))
         # Opening and closing: corners get round, and slits narrower than twice the radius are filled.
-        return whole.buffer(-SMOOTHING, 24).buffer(2 * SMOOTHING, 24).buffer(-SMOOTHING, 24)
+        for distance in (-SMOOTHING, 2 * SMOOTHING, -SMOOTHING):
+            whole = shapely.buffer(whole, distance, quad_segs=24)
+        return whole
 
     return _flat(_sound(draw), rng.uniform(*HEIGHTS))
 
@@ -103,8 +105,8 @@ def _sound(draw: Callable[[], shapely.Geometry]) -> shapely.Polygon:
 
 def _flat(outline: shapely.Polygon, height: float) -> Prism:
     """The prism of an outline, around its centroid."""
-    outline = outline.simplify(CURVE_TOLERANCE)
-    corners = shapely.get_coordinates(outline)[:-1] - shapely.get_coordinates(outline.centroid)
+    kept = shapely.simplify(outline, CURVE_TOLERANCE)
+    corners = shapely.get_coordinates(kept)[:-1] - shapely.get_coordinates(shapely.centroid(kept))
     return Prism(corners, height, fitting_bevel(corners, height))
 
 
