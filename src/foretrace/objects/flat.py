@@ -79,10 +79,11 @@ def sample_dented(rng: np.random.Generator) -> Prism:
         half = rng.uniform(*HALF_LENGTHS)
         whole: shapely.Geometry = _superellipse(half, rng.uniform(0.5, 1.0), rng.uniform(1.8, 4.0))
         for _ in range(rng.integers(1, 3)):
-            rim = shapely.line_interpolate_point(shapely.boundary(whole), rng.random(), normalized=True)
+            ring = shapely.get_exterior_ring(whole)
+            rim = shapely.line_interpolate_point(ring, rng.random(), normalized=True)
             at = shapely.get_coordinates(rim)[0]
             size = half * rng.uniform(0.15, 0.5)
-            middle = at + size * rng.uniform(0.0, 0.8) * at / np.linalg.norm(at)
+            middle = at + size * rng.uniform(0.0, 0.8) * (at / np.linalg.norm(at))
             whole = shapely.difference(whole, shapely.Point(middle).buffer(size, 90))
         # Opening and closing: corners get round, and slits narrower than twice the radius are filled.
         for distance in (-SMOOTHING, 2 * SMOOTHING, -SMOOTHING):
@@ -96,7 +97,12 @@ def _sound(draw: Callable[[], shapely.Geometry]) -> shapely.Polygon:
     """The first drawn outline in one part and without a neck too narrow to stand on."""
     while True:
         outline = draw()
-        if not isinstance(outline, shapely.Polygon) or not outline.is_valid or outline.is_empty:
+        if (
+            not isinstance(outline, shapely.Polygon)
+            or not outline.is_valid
+            or outline.is_empty
+            or outline.interiors
+        ):
             continue
         width = fitting_bevel(np.array(outline.exterior.coords[:-1]), np.inf).width
         if isinstance(bottom := outline.buffer(-width - NECK / 2), shapely.Polygon) and not bottom.is_empty:
