@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 
 from factories import fake_batch
-from foretrace.cli.learning import _known_physics
+from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.protocol import Recipe, measure_errors
 from foretrace.interactions.dataset import InteractionBatch
@@ -192,5 +192,5 @@ def test_a_checkpoint_that_knows_nonsense_is_refused(tmp_path, run):
 )
 def test_options_of_predict_are_checked(given, knows, simulated, message):
     with pytest.raises(PredictionError, match=message):
-        _known_physics(given, knows, simulated)
-    assert _known_physics({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
+        _told_values(given, knows, simulated)
+    assert _told_values({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}

@@ -31,7 +31,7 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
 from foretrace.predictor import EffectPredictor, TrainConfig
-from foretrace.predictor.known import KNOWN
+from foretrace.predictor.known import CONSTANTS
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.surroundings import thread_count
 from foretrace.predictor.training import fit_predictor
@@ -40,7 +40,7 @@ EXPERIMENT = "randomisation"
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"
 SETTINGS = (PLAIN, VARIED, KNOWING)
 """What is learned from: plain data; randomised data; the same, with friction and density known."""
-NAMES = tuple(KNOWN)
+NAMES = tuple(CONSTANTS)
 GROUPS = ("printed", "everyday")
 """Objects of the stand-in."""
 
