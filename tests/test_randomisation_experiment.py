@@ -51,7 +51,7 @@ def fake_simulate(config: CollectConfig, id: int):
     varied = config.randomisation != NOTHING
     outcome = Outcome.SLIPPED if id % (5 if varied else 13) == 3 else Outcome.LEVERED
     made = factories.fake_lever_up(obj, action, id=id, seed=seed, num_samples=12, outcome=outcome)
-    _, physics, _ = config.randomisation.vary(obj, Physics(), np.random.default_rng(id))
+    _, physics, _, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
     return replace(made, physics=physics)
 
 
