@@ -272,7 +272,9 @@ def test_simulate_vary_action_from_the_command_line(tmp_path):
 
 def test_a_path_that_cannot_be_is_refused_and_its_trial_named(tmp_path):
     deep = replace(PLAIN, randomisation=Randomisation(insertion=(0.2, 0.2)))
-    with pytest.raises(SimulationError, match=r"trial 0 cannot be simulated: tool path: insertion = 0\.2 is outside"):
+    with pytest.raises(
+        SimulationError, match=r"trial 0 cannot be simulated: tool path: insertion = 0\.2 is outside"
+    ):
         collect(deep, tmp_path, workers=1, console=Console(quiet=True))
 
 
