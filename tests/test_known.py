@@ -9,6 +9,7 @@ from safetensors.torch import load_file
 
 from factories import fake_batch
 from foretrace.actions import Stroke, ToolPath
+from foretrace.cli import main
 from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.protocol import Recipe, measure_errors
@@ -218,6 +219,30 @@ def test_the_actions_parameters_are_told_as_constants_are(batch):
         PredictionError, match=r"has to know speed: give known=\{'sweep': value in rad, 'speed': value"
     ):
         predictor.imagine(view_of(batch, 0), known={"sweep": 0.5})
+
+
+def test_predict_is_told_of_the_action_and_compares_with_it(tmp_path, batch, capsys):
+    sweep = np.random.default_rng(3).uniform(0.4, 1.0, 40)
+    config = replace(KNOWING, known=("sweep",))
+    run = train_predictor(replace(batch, sweep=sweep), config, tmp_path / "run", progress=False)
+    polygon = tmp_path / "polygon.txt"
+    polygon.write_text("0.1 0\n0.02 0.09\n-0.08 0.05\n-0.07 -0.06\n0.04 -0.09\n")
+    command = ["predict", str(run), "--polygon", str(polygon), "--edge", "1", "--compare", "--no-animation"]
+    assert main(command) == 2
+    assert "has to know sweep: give --sweep" in capsys.readouterr().err
+    rises = {}
+    for told in (0.45, 0.95):
+        out = tmp_path / f"{told}"
+        assert main([*command, "--sweep", str(told), "--speed", "1.3", "--out", str(out)]) == 0
+        content = json.loads((out / "trajectory.json").read_text())
+        rises[told] = [
+            np.array(path)[:, 2].max() - path[0][2]
+            for path in (content["com_trajectory"], content["simulated"]["com_trajectory"])
+        ]
+        faster = ToolPath(sweep=told).faster(1.3).duration
+        assert len(content["simulated"]["com_trajectory"]) == round(faster / 0.05) + 1
+    assert rises[0.95][0] != rises[0.45][0]
+    assert rises[0.95][1] > 1.5 * rises[0.45][1]
 
 
 def test_true_values_are_those_of_physics_and_stroke():

@@ -125,7 +125,7 @@ def randomisation_figure(table: pd.DataFrame) -> Figure:
     ]
     fig.legend(handles=patches, loc="outside lower center", ncols=2, columnspacing=1.4)
     note = f"bars: means over {seeds_in_words(table)} with 95 % bootstrap intervals; dots: seeds"
-    finish(fig, "What randomised training data do for transfer", note)
+    finish(fig, "What randomised training data do, and what it helps to know what varies", note)
     return fig
 
 
