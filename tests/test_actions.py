@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foretrace.actions import CORNER_MARGIN, LeverUp, sample_contacts
+from foretrace.actions import CORNER_MARGIN, USUAL_STROKE, LeverUp, Stroke, ToolPath, sample_contacts
 from foretrace.errors import ActionError
 from foretrace.geometry import inward_normals, transform_points
 from foretrace.objects import NO_BEVEL, Prism, sample_prism
@@ -116,3 +116,42 @@ def test_moved_actions():
     action = LeverUp((0.0, 0.0), (0.0, 1.0)).moved(ahead=0.003, left=0.001, turn=np.pi / 2)
     np.testing.assert_allclose(action.contact, [-0.001, 0.003], atol=1e-12)
     np.testing.assert_allclose(action.direction, [-1.0, 0.0], atol=1e-12)
+
+
+@given(
+    st.floats(0.0, 0.1),
+    st.floats(0.02, 1.0),
+    st.floats(0.0, np.pi / 2),
+    st.floats(0.1, 5.0),
+    st.floats(0.0, 0.6),
+)
+def test_a_stroke_is_what_its_path_does(insertion, arc_radius, sweep, speed, phase):
+    stroke = Stroke(insertion, arc_radius, sweep, speed)
+    path = stroke.path()
+    found = Stroke.of(path)
+    assert (found.insertion, found.arc_radius, found.sweep) == (insertion, arc_radius, sweep)
+    assert found.speed == pytest.approx(speed, rel=1e-12)
+    # The same places, so many times as soon.
+    usual = Stroke(insertion, arc_radius, sweep).path()
+    moment = phase * (usual.insert_time + usual.lift_time)
+    times = np.array([usual.wait_time + moment, path.wait_time + moment / speed])
+    np.testing.assert_allclose(usual.at(times[:1]), path.at(times[1:]), atol=1e-9)
+
+
+def test_the_usual_path_has_the_usual_stroke():
+    assert Stroke.of(ToolPath()) == USUAL_STROKE == Stroke()
+    assert USUAL_STROKE.path() == ToolPath()
+
+
+@pytest.mark.parametrize(
+    ("stroke", "fault"),
+    [
+        (Stroke(speed=0.0), "speed = 0.0 times the usual one: give a number above 0"),
+        (Stroke(speed=float("nan")), "speed = nan"),
+        (Stroke(speed=100.0), "insert_time = 0.006 is outside 0.05 to 60"),
+        (Stroke(insertion=0.2), "insertion = 0.2 is outside 0 to 0.1"),
+    ],
+)
+def test_paths_that_cannot_be_are_refused(stroke, fault):
+    with pytest.raises(ActionError, match=fault):
+        stroke.path()

@@ -1,6 +1,6 @@
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -8,14 +8,18 @@ import torch
 from safetensors.torch import load_file
 
 from factories import fake_batch
-from foretrace.cli.learning import _known_physics
+from foretrace.actions import Stroke, ToolPath
+from foretrace.cli import main
+from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.protocol import Recipe, measure_errors
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor import TrainConfig, load_predictor, train_predictor
 from foretrace.predictor.checkpoint import read_config
+from foretrace.predictor.known import PARAMETERS, true_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.training import fit_predictor
 
@@ -192,5 +196,57 @@ def test_a_checkpoint_that_knows_nonsense_is_refused(tmp_path, run):
 )
 def test_options_of_predict_are_checked(given, knows, simulated, message):
     with pytest.raises(PredictionError, match=message):
-        _known_physics(given, knows, simulated)
-    assert _known_physics({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
+        _told_values(given, knows, simulated)
+    assert _told_values({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
+
+
+def test_the_actions_parameters_are_told_as_constants_are(batch):
+    assert set(PARAMETERS) == set(asdict(Stroke()))
+    rng = np.random.default_rng(3)
+    sweep = rng.uniform(0.4, 1.0, 40)
+    rest = batch.com[:, :1]
+    farther = replace(batch, sweep=sweep, com=rest + (batch.com - rest) * sweep[:, None, None])
+    config = replace(KNOWING, known=("sweep", "speed"), hidden=32, epochs=40)
+    split = split_by_seed(40, 0, None)
+    predictor, _ = fit_predictor(farther, config, split)
+    low, high = (
+        predictor.imagine(view_of(batch, 0), batch.com[0, 0], {"sweep": value, "speed": 1.0}).com_trajectory
+        for value in (0.45, 0.95)
+    )
+    way = [np.linalg.norm(path[-1] - path[0]) for path in (low, high)]
+    assert way[1] > 1.3 * way[0]
+    with pytest.raises(
+        PredictionError, match=r"has to know speed: give known=\{'sweep': value in rad, 'speed': value"
+    ):
+        predictor.imagine(view_of(batch, 0), known={"sweep": 0.5})
+
+
+def test_predict_is_told_of_the_action_and_compares_with_it(tmp_path, batch, capsys):
+    sweep = np.random.default_rng(3).uniform(0.4, 1.0, 40)
+    config = replace(KNOWING, known=("sweep",))
+    run = train_predictor(replace(batch, sweep=sweep), config, tmp_path / "run", progress=False)
+    polygon = tmp_path / "polygon.txt"
+    polygon.write_text("0.1 0\n0.02 0.09\n-0.08 0.05\n-0.07 -0.06\n0.04 -0.09\n")
+    command = ["predict", str(run), "--polygon", str(polygon), "--edge", "1", "--compare", "--no-animation"]
+    assert main(command) == 2
+    assert "has to know sweep: give --sweep" in capsys.readouterr().err
+    rises = {}
+    for told in (0.45, 0.95):
+        out = tmp_path / f"{told}"
+        assert main([*command, "--sweep", str(told), "--speed", "1.3", "--out", str(out)]) == 0
+        content = json.loads((out / "trajectory.json").read_text())
+        rises[told] = [
+            np.array(path)[:, 2].max() - path[0][2]
+            for path in (content["com_trajectory"], content["simulated"]["com_trajectory"])
+        ]
+        faster = ToolPath(sweep=told).faster(1.3).duration
+        assert len(content["simulated"]["com_trajectory"]) == round(faster / 0.05) + 1
+    assert rises[0.95][0] != rises[0.45][0]
+    assert rises[0.95][1] > 1.5 * rises[0.45][1]
+
+
+def test_true_values_are_those_of_physics_and_stroke():
+    names = ("sweep", "friction", "insertion")
+    found = true_values(Physics(friction=0.6), names, Stroke(insertion=0.03))
+    assert found == {"sweep": ToolPath.sweep, "friction": 0.6, "insertion": 0.03}
+    assert list(found) == list(names)

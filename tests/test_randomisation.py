@@ -8,7 +8,7 @@ from rich.console import Console
 
 import factories
 from engines_at_hand import WITHOUT_BULLET
-from foretrace.actions import LeverUp
+from foretrace.actions import USUAL_STROKE, LeverUp, Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError
 from foretrace.evaluation.description import describe_dataset
@@ -21,11 +21,20 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import NO_BEVEL, Box, Cylinder, Prism
 from foretrace.simulation.collect import CollectConfig, collect, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.randomisation import FACTORS, LARGEST, NOTHING, RANDOMISED, RANGES, Randomisation
+from foretrace.simulation.randomisation import (
+    FACTORS,
+    LARGEST,
+    NOTHING,
+    RANDOMISED,
+    RANGES,
+    VARIED_ACTION,
+    Randomisation,
+)
 
 TOOL = SimulationConfig(embodiment="tool")
 PLAIN = CollectConfig(objects=8, simulation=TOOL)
 VARIED = replace(PLAIN, randomisation=RANDOMISED)
+EVERYTHING = replace(RANDOMISED, **VARIED_ACTION)
 PENTAGON = Prism([[0.1, 0.0], [0.02, 0.09], [-0.08, 0.05], [-0.07, -0.06], [0.04, -0.09]])
 
 
@@ -44,7 +53,9 @@ def fake_trial(config: CollectConfig, id: int) -> Interaction:
 
 def drawn(randomisation: Randomisation, seed: int) -> dict[str, float]:
     """What one lever-up of a prism gets."""
-    obj, physics, misplacement = randomisation.vary(PENTAGON, Physics(), np.random.default_rng(seed))
+    obj, physics, path, misplacement = randomisation.vary(
+        PENTAGON, Physics(), ToolPath(), np.random.default_rng(seed)
+    )
     assert isinstance(obj, Prism)
     return {
         "friction": physics.friction,
@@ -54,6 +65,7 @@ def drawn(randomisation: Randomisation, seed: int) -> dict[str, float]:
         "bevel_width_factor": obj.bevel.width / PENTAGON.bevel.width,
         "bevel_height_factor": obj.bevel.height / PENTAGON.bevel.height,
         **{f"misplaced_{name}": value for name, value in asdict(misplacement).items()},
+        **asdict(Stroke.of(path)),
     }
 
 
@@ -68,8 +80,8 @@ def varied(tmp_path_factory):
 
 
 def test_draws_fill_their_ranges_and_stay_within():
-    every = [drawn(RANDOMISED, seed) for seed in range(300)]
-    limits = {name: getattr(RANDOMISED, name) for name in RANGES}
+    every = [drawn(EVERYTHING, seed) for seed in range(300)]
+    limits = {name: getattr(EVERYTHING, name) for name in RANGES}
     limits |= {name: (-getattr(RANDOMISED, name), getattr(RANDOMISED, name)) for name in LARGEST}
     assert limits.keys() == {field.name for field in fields(Randomisation)}
     values = {name: np.array([each[name] for each in every]) for name in limits}
@@ -83,23 +95,41 @@ def test_draws_fill_their_ranges_and_stay_within():
 
 @pytest.mark.parametrize("name", [*RANGES, *LARGEST])
 def test_what_is_drawn_for_one_quantity_does_not_depend_on_the_others(name):
-    alone = Randomisation(**{name: getattr(RANDOMISED, name)})
-    expected = drawn(NOTHING, 5) | {name: drawn(RANDOMISED, 5)[name]}
+    alone = Randomisation(**{name: getattr(EVERYTHING, name)})
+    expected = drawn(NOTHING, 5) | {name: drawn(EVERYTHING, 5)[name]}
     assert drawn(alone, 5) == pytest.approx(expected)
     assert drawn(alone, 5)[name] != drawn(NOTHING, 5)[name]
+
+
+def test_what_was_drawn_before_the_action_varied_is_drawn_still():
+    numbers = drawn(RANDOMISED, 5)
+    shares = np.random.default_rng(5).random(9)
+    assert numbers["friction"] == 0.5 + shares[0] * (1.1 - 0.5)
+    assert numbers["misplaced_turn"] == np.deg2rad(3.0) * (2 * shares[8] - 1)
+    assert {name: numbers[name] for name in asdict(USUAL_STROKE)} == asdict(USUAL_STROKE)
+
+
+def test_fast_and_slow_blades_end_at_the_same_time():
+    for seed in range(20):
+        path = EVERYTHING.vary(PENTAGON, Physics(), ToolPath(), np.random.default_rng(seed))[2]
+        assert path.duration == pytest.approx(ToolPath().faster(2 / 3).duration, abs=1e-12)
+        assert path.hold_time >= ToolPath().hold_time - 1e-12
+        ratio = path.lift_time / path.insert_time
+        assert ratio == pytest.approx(ToolPath().lift_time / ToolPath().insert_time)
 
 
 def test_objects_without_thickness_or_bevel_stay_as_they_are():
     shape = Randomisation(**{name: (0.5, 0.9) for name in FACTORS})
     rng = np.random.default_rng(0)
     cylinder = Cylinder(0.02, 0.1)
-    assert shape.vary(cylinder, Physics(), rng)[0] is cylinder
-    assert NOTHING.vary(PENTAGON, Physics(), rng)[0] is PENTAGON
-    box, _, _ = shape.vary(Box(0.1, 0.06, 0.04), Physics(), rng)
+    rest = (Physics(), ToolPath(), rng)
+    assert shape.vary(cylinder, *rest)[0] is cylinder
+    assert NOTHING.vary(PENTAGON, *rest)[0] is PENTAGON
+    box = shape.vary(Box(0.1, 0.06, 0.04), *rest)[0]
     assert isinstance(box, Box)
     assert (box.width, box.depth) == (0.1, 0.06)
     assert 0.02 <= box.height <= 0.036
-    sharp, _, _ = shape.vary(Prism(PENTAGON.corners, 0.02, NO_BEVEL), Physics(), rng)
+    sharp = shape.vary(Prism(PENTAGON.corners, 0.02, NO_BEVEL), *rest)[0]
     assert isinstance(sharp, Prism)
     assert sharp.bevel == NO_BEVEL
 
@@ -111,6 +141,8 @@ def test_objects_without_thickness_or_bevel_stay_as_they_are():
         ("tool_friction", (0.0, 0.5)),
         ("density", (float("nan"), 900.0)),
         ("thickness_factor", (0.5, float("inf"))),
+        ("insertion", (0.03, 0.01)),
+        ("speed", (0.0, 1.0)),
         ("misplaced_ahead", 0.02),
         ("misplaced_left", -0.001),
         ("misplaced_turn", float("nan")),
@@ -199,12 +231,14 @@ def test_a_plain_folder_is_not_gone_on_with_randomised(tmp_path):
     manifest = storage.read_manifest(tmp_path)
     del manifest["configuration"]["randomisation"]  # as older data sets have it
     first = storage.shard_name(0)
-    older = storage.read_shard(tmp_path, first)[0].drop_columns(list(LARGEST))
+    older = storage.read_shard(tmp_path, first)[0].drop_columns([*LARGEST, *storage.STROKE_COLUMNS])
     manifest["shards"][first] = storage.write_shard(tmp_path, first, older)
     storage.write_manifest(tmp_path, manifest)
     collect(PLAIN, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
     assert examine(tmp_path).findings == ()
     assert Dataset.open(tmp_path)[0].misplacement == AS_TOLD
+    assert Dataset.open(tmp_path)[0].stroke == USUAL_STROKE
+    assert Dataset.open(tmp_path).batch().sweep[0] == ToolPath.sweep
 
 
 def test_simulate_randomise_from_the_command_line(tmp_path):
@@ -215,6 +249,33 @@ def test_simulate_randomise_from_the_command_line(tmp_path):
     assert len(set(dataset.table["friction"].to_pylist())) == len(dataset) == 3
     configuration = json.loads(json.dumps(asdict(RANDOMISED)))
     assert dataset.manifest["configuration"]["randomisation"] == configuration
+
+
+def test_simulate_vary_action_from_the_command_line(tmp_path):
+    options = ["--objects", "1", "--contacts-per-edge", "1", "--embodiment", "tool", "--workers", "1"]
+    command = ["simulate", *options, "--vary-action"]
+    assert main([*command, "--out", str(tmp_path / "action")]) == 0
+    assert main([*command, "--out", str(tmp_path / "both"), "--randomise"]) == 0
+    action, both = (Dataset.open(tmp_path / name) for name in ("action", "both"))
+    assert {len(row.effect.times) for row in action} == {round(ToolPath().faster(2 / 3).duration / 0.05) + 1}
+    assert [row.stroke for row in action] == [row.stroke for row in both]
+    assert len({row.stroke for row in action}) == 3
+    assert {row.physics for row in action} == {Physics()}
+    assert len({row.physics for row in both}) == 3
+    for row in action:
+        path = row.stroke.path()
+        tip = row.effect.tool_trajectory[:, :3]
+        np.testing.assert_allclose(tip[:, [0, 2]], path.at(row.effect.times)[:, :2], atol=1e-3)
+    assert examine(tmp_path / "both").findings == ()
+    assert describe_dataset(action)["varies"].keys() == set(VARIED_ACTION)
+
+
+def test_a_path_that_cannot_be_is_refused_and_its_trial_named(tmp_path):
+    deep = replace(PLAIN, randomisation=Randomisation(insertion=(0.2, 0.2)))
+    with pytest.raises(
+        SimulationError, match=r"trial 0 cannot be simulated: tool path: insertion = 0\.2 is outside"
+    ):
+        collect(deep, tmp_path, workers=1, console=Console(quiet=True))
 
 
 @WITHOUT_BULLET

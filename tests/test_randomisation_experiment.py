@@ -1,5 +1,4 @@
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ from rich.console import Console
 
 import factories
 from engines_at_hand import WITHOUT_BULLET
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.errors import DatasetError, ResultsError
 from foretrace.evaluation import randomisation
@@ -38,11 +37,14 @@ from foretrace.evaluation.transfer_objects import PENTAGON, Subject
 from foretrace.interactions.record import Outcome, Physics
 from foretrace.predictor import TrainConfig
 from foretrace.predictor.base import EffectPredictor, ImaginedBatch
+from foretrace.predictor.known import PARAMETERS
 from foretrace.simulation.collect import CollectConfig, collect, trial
-from foretrace.simulation.randomisation import NOTHING, RANDOMISED
+from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION, Randomisation
 
 QUIET = Console(quiet=True)
 RECIPE = RandomisationRecipe(TrainConfig(hidden=8, epochs=1, min_steps=1, device="cpu", threads=1), repeats=1)
+
+ACTION = replace(RECIPE, repeats=0, known=tuple(PARAMETERS))
 
 
 def fake_simulate(config: CollectConfig, id: int):
@@ -51,15 +53,17 @@ def fake_simulate(config: CollectConfig, id: int):
     varied = config.randomisation != NOTHING
     outcome = Outcome.SLIPPED if id % (5 if varied else 13) == 3 else Outcome.LEVERED
     made = factories.fake_lever_up(obj, action, id=id, seed=seed, num_samples=12, outcome=outcome)
-    _, physics, _ = config.randomisation.vary(obj, Physics(), np.random.default_rng(id))
-    return replace(made, physics=physics)
+    _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
+    return replace(made, physics=physics, stroke=Stroke.of(path))
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("randomisation")
     plain = CollectConfig(8, 1)
-    for name, config in (("plain", plain), ("varied", replace(plain, randomisation=RANDOMISED))):
+    action = Randomisation(**VARIED_ACTION)
+    for name, drawn in (("plain", NOTHING), ("varied", RANDOMISED), ("action", action)):
+        config = replace(plain, randomisation=drawn)
         collect(config, root / name, workers=1, console=QUIET, simulate=fake_simulate)
     return root / "plain", root / "varied"
 
@@ -194,9 +198,52 @@ def test_impossible_comparisons_are_refused(folders, tmp_path, wrong, message):
         run_randomisation(*folders, tmp_path, **wrong, console=QUIET)
 
 
-def test_repeats_are_at_least_one():
-    with pytest.raises(ResultsError, match="repeats is 0"):
-        RandomisationRecipe(repeats=0)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"repeats": -1}, "repeats is -1"), ({"known": ()}, "name what varies, of friction")],
+)
+def test_impossible_recipes_are_refused(wrong, message):
+    with pytest.raises(ResultsError, match=message):
+        RandomisationRecipe(**wrong)
+
+
+# --- the action's parameters ----------------------------------------------------------------------------------
+
+
+def test_what_the_default_recipe_says_of_itself_has_not_changed():
+    assert "known" not in RandomisationRecipe().describe()
+    assert ACTION.describe()["known"] == tuple(PARAMETERS)
+
+
+def test_actions_that_vary_are_told_without_a_stand_in(folders, tmp_path, monkeypatch):
+    plain, action = folders[0], folders[0].parent / "action"
+    told = []
+    measure = randomisation.measure_errors
+
+    def spy(predictor, batch, inputs):
+        if predictor.known:
+            told.append((predictor.known, batch))
+        return measure(predictor, batch, inputs)
+
+    monkeypatch.setattr(randomisation, "measure_errors", spy)
+    assert run_randomisation(plain, action, tmp_path, ["none"], [0], ACTION, console=QUIET) == []
+    table = read_results(tmp_path)
+    assert not table["metric"].str.contains("stand_in").any()
+    assert table.groupby("setting")["metric"].nunique().to_dict() == {PLAIN: 6, VARIED: 6, KNOWING: 8}
+    assert {known for known, _ in told} == {tuple(PARAMETERS)}
+    spreads = [np.ptp(batch.sweep) > 0.1 for _, batch in told]
+    assert spreads == [False, False, True, False]  # plain, told the usual, varied, told the usual
+    assert set(told[3][1].sweep) == {ToolPath.sweep}
+    assert list(summarise(table)["none"]) == ["plain test", "randomised test"]
+    assert [label.get_text() for label in randomisation_figure(table).axes[0].get_xticklabels()] == [
+        *("plain test", "randomised test")
+    ]
+    with pytest.raises(
+        ResultsError, match=r"insertion is the same all over .*: simulate it with --vary-action"
+    ):
+        run_randomisation(*folders, tmp_path / "other", ["none"], [0], ACTION, console=QUIET)
+    with pytest.raises(ResultsError, match=r"holds results with data"):
+        run_randomisation(*folders, tmp_path, ["none"], [0], RECIPE, console=QUIET)
 
 
 # --- report ---------------------------------------------------------------------------------------------------
@@ -243,7 +290,7 @@ def test_an_unfinished_comparison_is_reported_as_far_as_it_is(results):
 @WITHOUT_BULLET
 def test_the_command_writes_table_summary_and_picture(folders, shown, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(randomisation, "_shown_once", lambda stand_in, repeats: shown)
-    monkeypatch.setattr("foretrace.predictor.TrainConfig", partial(TrainConfig, hidden=8, min_steps=1))
+    monkeypatch.setattr("foretrace.predictor.RECIPES", {"lstm": TrainConfig(hidden=8, min_steps=1)})
     out = tmp_path / "out"
     plain, varied = map(str, folders)
     options = ["--features", "none", "--seeds", "0", "--epochs", "1", "--repeats", "1"]
@@ -253,7 +300,7 @@ def test_the_command_writes_table_summary_and_picture(folders, shown, tmp_path, 
     )
     names = {file.name for file in out.iterdir()} - {".lock"}
     assert names == {"results.csv", "results.json", "summary.json", "randomisation.md", "randomisation.png"}
-    assert "constants known" in capsys.readouterr().out
+    assert "values known" in capsys.readouterr().out
     assert Trial("randomisation", "none", 0, KNOWING) in {
         Trial(*row)
         for row in read_results(out)[["experiment", "features", "seed", "setting"]].itertuples(index=False)

@@ -1,6 +1,6 @@
 """The lever-up action: where the blade goes under the object, and which way it pushes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -223,6 +223,16 @@ class ToolPath:
         """Time at which the lift begins [s]."""
         return self.wait_time + self.insert_time
 
+    def faster(self, speed: float) -> "ToolPath":
+        """The path pushed in and lifted so many times as fast; it waits and holds as long as before.
+
+        Raises:
+            ActionError: if the speed is not above 0, or too much of it is asked for.
+        """
+        if not speed > 0:
+            raise ActionError(f"tool path: speed = {speed} times the usual one: give a number above 0")
+        return replace(self, insert_time=self.insert_time / speed, lift_time=self.lift_time / speed)
+
     def at(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3"]:
         """Blade tip over time.
 
@@ -238,6 +248,39 @@ class ToolPath:
         x = x + self.arc_radius * (1 - np.cos(angle))
         z = self.clearance + self.arc_radius * np.sin(angle)
         return np.stack([x, z, self.pitch + self.pitch_gain * angle], axis=-1)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """What may differ from one lever-up's tool path to the next: the action's parameters (paper, section 6)."""
+
+    insertion: float = ToolPath.insertion
+    """How far the blade tip is pushed under the object, past the contact point [m]."""
+    arc_radius: float = ToolPath.arc_radius
+    """Radius of the arc on which the tip is lifted [m]."""
+    sweep: float = ToolPath.sweep
+    """Angle of that arc [rad]."""
+    speed: float = 1.0
+    """Times as fast as usual the blade is pushed in and lifts."""
+
+    @classmethod
+    def of(cls, path: ToolPath) -> "Stroke":
+        """What a path does; its speed is that of pushing in and lifting together."""
+        usual = ToolPath.insert_time + ToolPath.lift_time
+        speed = usual / (path.insert_time + path.lift_time)
+        return cls(path.insertion, path.arc_radius, path.sweep, speed)
+
+    def path(self) -> ToolPath:
+        """The usual path with these parameters.
+
+        Raises:
+            ActionError: One of them is out of its range.
+        """
+        return ToolPath(self.insertion, self.arc_radius, self.sweep).faster(self.speed)
+
+
+USUAL_STROKE = Stroke()
+"""That of the usual path."""
 
 
 def _minimum_jerk(phase: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:

@@ -25,6 +25,7 @@ def simulate(
     watch_time: float | None = None,
     table_edge: float | None = None,
     randomise: bool = False,
+    vary_action: bool = False,
 ) -> None:
     """Simulate lever-ups of many objects into a data set.
 
@@ -49,11 +50,14 @@ def simulate(
             default no edge is within reach.
         randomise: Draw friction, density, thickness and bevel anew for every lever-up, and let the blade err in
             place and direction. Objects, contact points and what is told of them stay the same.
+        vary_action: Draw how deep the blade goes, on what arc it lifts and how fast anew for every lever-up.
     """
+    from dataclasses import replace
+
     from foretrace.interactions.record import Physics
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig
-    from foretrace.simulation.randomisation import NOTHING, RANDOMISED
+    from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION
 
     if watch_time is None:
         watch_time = 0.0 if recipe == "paper" else ROLLING_TIME
@@ -64,9 +68,10 @@ def simulate(
         watch_time=watch_time,
         physics=Physics(table_edge=table_edge),
     )
-    config = CollectConfig(
-        objects, contacts_per_edge, seed, simulation, recipe, RANDOMISED if randomise else NOTHING
-    )
+    randomisation = RANDOMISED if randomise else NOTHING
+    if vary_action:
+        randomisation = replace(randomisation, **VARIED_ACTION)
+    config = CollectConfig(objects, contacts_per_edge, seed, simulation, recipe, randomisation)
     try:
         counts = collect(config, out, workers)
     except KeyboardInterrupt:

@@ -62,7 +62,8 @@ def train(
         heights: Let the one-shot predictor see height maps, too, for objects that are not flat.
         hidden: Units of the LSTM, by default 256; or of each layer of the one-shot predictor, by default 128.
         motions: Principal motions that the one-shot predictor puts trajectories together from.
-        known: Physical constants that the predictor is told beside the view: friction, tool_friction, density.
+        known: What the predictor is told beside the view: friction, tool_friction, density; of the action insertion,
+            arc_radius, sweep, speed.
         outcomes: Outcomes of the interactions to learn from.
         split: Sizes of training, validation and test part; by default the paper's 1400 100 300, or in the same
             proportion where the data set is smaller.
@@ -135,6 +136,10 @@ def predict(
     friction: float | None = None,
     tool_friction: float | None = None,
     density: float | None = None,
+    insertion: float | None = None,
+    arc_radius: float | None = None,
+    sweep: float | None = None,
+    speed: float | None = None,
     compare: bool = False,
     animation: bool = True,
     out: Path = Path("prediction"),
@@ -166,12 +171,17 @@ def predict(
         friction: Friction coefficient between object and table, for a predictor that knows it and for --compare.
         tool_friction: Friction coefficient between object and blade, likewise.
         density: Density of the object [kg/m^3], likewise.
+        insertion: How far the blade goes under the object [m], likewise.
+        arc_radius: Radius of the arc on which it lifts [m], likewise.
+        sweep: Angle of that arc [rad], likewise.
+        speed: Times as fast as usual, likewise.
         compare: Simulate the same lever-up and show truth and error beside the prediction.
         animation: Write an animation as well.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
     """
     from dataclasses import replace
 
+    from foretrace.actions import Stroke
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
     from foretrace.evaluation.animation import scene_animation
     from foretrace.evaluation.figures import Scene, scene_figure
@@ -201,12 +211,15 @@ def predict(
         obj, action, view, com = _object_and_action(
             polygon, image, scale, mesh, height, edge, fraction, contact
         )
-    given = {"friction": friction, "tool_friction": tool_friction, "density": density}
-    physics = _known_physics(given, predictor.known, compare)
-    imagined = predictor.imagine(view, com, {name: physics[name] for name in predictor.known})
+    constants = {"friction": friction, "tool_friction": tool_friction, "density": density}
+    parameters = {"insertion": insertion, "arc_radius": arc_radius, "sweep": sweep, "speed": speed}
+    told = _told_values(constants | parameters, predictor.known, compare)
+    imagined = predictor.imagine(view, com, {name: told[name] for name in predictor.known})
     name = f"{predictor.features.label} + LSTM" if predictor.label == "lstm" else predictor.label
     paths = {name: imagined.com_trajectory}
-    simulation = SimulationConfig(physics=Physics(**physics))
+    physics = Physics(**{name: told[name] for name in constants if name in told})
+    stroke = Stroke(**{name: told[name] for name in parameters if name in told})
+    simulation = SimulationConfig(physics=physics, path=stroke.path())
     truth = simulate_lever_up(obj, action, simulation) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
         title = f"Predicted and simulated lever-up: {truth.effect.outcome}"
@@ -227,15 +240,13 @@ def predict(
     print("\n".join(str(file) for file in sorted(out.iterdir())))
 
 
-def _known_physics(
-    given: dict[str, float | None], knows: tuple[str, ...], simulated: bool
-) -> dict[str, float]:
-    """The constants that the command line names.
+def _told_values(given: dict[str, float | None], knows: tuple[str, ...], simulated: bool) -> dict[str, float]:
+    """The constants and parameters that the command line names.
 
     Raises:
         PredictionError: One that the predictor has to know is missing, one is not above 0, or is of no use.
     """
-    physics = {name: value for name, value in given.items() if value is not None}
+    told = {name: value for name, value in given.items() if value is not None}
     for name, value in given.items():
         option = f"--{name.replace('_', '-')}"
         if value is None and name in knows:
@@ -244,7 +255,7 @@ def _known_physics(
             raise PredictionError(f"{option} is {value}: give a number above 0")
         if value is not None and name not in knows and not simulated:
             raise PredictionError(f"the predictor does not know {name}: leave {option} out, or --compare")
-    return physics
+    return told
 
 
 def _object_and_action(

@@ -8,9 +8,13 @@ import numpy as np
 from foretrace.geometry import quaternion_to_matrix, support_edge, tilt
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
+from foretrace.interactions.storage import STROKE_COLUMNS
 
 CM, MM = 100.0, 1000.0
-VARIABLE = ("density", "friction", "tool_friction", "misplaced_ahead", "misplaced_left", "misplaced_turn")
+VARIABLE = (
+    *("density", "friction", "tool_friction", "misplaced_ahead", "misplaced_left", "misplaced_turn"),
+    *STROKE_COLUMNS,
+)
 """Columns that may be drawn anew for every interaction."""
 
 

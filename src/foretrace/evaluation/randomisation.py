@@ -1,8 +1,9 @@
-"""What randomised training data do for transfer, and what it helps to know friction and density (paper, section 6).
+"""What randomised training data do for transfer, and what it helps to know what was drawn (paper, section 6).
 
 Three predictors per seed are trained on equally many interactions: of the plain data, of the randomised data, and of
-the randomised data with known friction and density. All are judged by plain and by randomised test interactions and by
-the stand-in for the real robot, which is another engine with other constants and with senses that err.
+the randomised data with what varies known: friction and density, or the action's parameters. All are judged by plain
+and by randomised test interactions and, if wanted, by the stand-in for the real robot, which is another engine with
+other constants and with senses that err.
 
 Objects are split, not interactions: no object of a test part was learned from, in either data set.
 """
@@ -31,7 +32,7 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
 from foretrace.predictor import EffectPredictor, TrainConfig
-from foretrace.predictor.known import KNOWN
+from foretrace.predictor.known import CONSTANTS, KNOWN, check_names, true_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.surroundings import thread_count
 from foretrace.predictor.training import fit_predictor
@@ -39,8 +40,9 @@ from foretrace.predictor.training import fit_predictor
 EXPERIMENT = "randomisation"
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"
 SETTINGS = (PLAIN, VARIED, KNOWING)
-"""What is learned from: plain data; randomised data; the same, with friction and density known."""
-NAMES = tuple(KNOWN)
+"""What is learned from: plain data; randomised data; the same, with what varies known."""
+NAMES = tuple(CONSTANTS)
+"""What is known by default."""
 GROUPS = ("printed", "everyday")
 """Objects of the stand-in."""
 
@@ -54,16 +56,24 @@ class RandomisationRecipe:
     stand_in: StandIn = field(default_factory=StandIn)
     """What stands in for the real robot."""
     repeats: int = 3
-    """Lever-ups by the stand-in at every contact."""
+    """Lever-ups by the stand-in at every contact; with 0 it judges nothing."""
+    known: tuple[str, ...] = NAMES
+    """What varies, and is known to the predictors that are told."""
 
     def __post_init__(self) -> None:
-        if self.repeats < 1:
-            raise ResultsError(f"repeats is {self.repeats}, it must be at least 1")
+        check_names(self.known)
+        if not self.known:
+            raise ResultsError(f"nothing is known to anybody: name what varies, of {', '.join(KNOWN)}")
+        if self.repeats < 0:
+            raise ResultsError(
+                f"repeats is {self.repeats}, it must not be negative: 0 leaves out the stand-in"
+            )
 
     def describe(self) -> dict[str, Any]:
         """As JSON-able settings."""
         training = Recipe(self.training).describe()
-        return {"training": training, "stand_in": asdict(self.stand_in), "repeats": self.repeats}
+        described = {"training": training, "stand_in": asdict(self.stand_in), "repeats": self.repeats}
+        return described if self.known == NAMES else described | {"known": self.known}
 
 
 class Both(NamedTuple):
@@ -82,22 +92,31 @@ class Shown(NamedTuple):
     observed: Observation
 
 
-def open_both(plain: str | Path, varied: str | Path) -> Both:
+def open_both(plain: str | Path, varied: str | Path, names: Sequence[str] = NAMES) -> Both:
     """Read both data sets.
+
+    Args:
+        plain: Folder of the data as told.
+        varied: Folder of the randomised data.
+        names: What must vary in the second only.
 
     Raises:
         DatasetError: One of them is missing or damaged.
         ResultsError: The first varies, the second does not, or they are sampled at different times.
     """
     both = Both(load_levered(plain), load_levered(varied))
-    for name in NAMES:
+    for name in names:
+        remedy = "--randomise" if name in CONSTANTS else "--vary-action"
         spans = [np.ptp(getattr(batch, name)) if len(batch) else 0.0 for batch in both]
         if spans[0] > 0:
-            raise ResultsError(f"{name} varies in {plain}: simulate the plain data without --randomise")
+            raise ResultsError(f"{name} varies in {plain}: simulate the plain data without {remedy}")
         if spans[1] == 0:
-            raise ResultsError(f"{name} is the same all over {varied}: simulate it with --randomise")
+            raise ResultsError(f"{name} is the same all over {varied}: simulate it with {remedy}")
     if not np.array_equal(both.plain.times, both.varied.times):
-        raise ResultsError(f"{plain} and {varied} are sampled at different times: simulate both alike")
+        raise ResultsError(
+            f"{plain} and {varied} are sampled at different times: simulate both alike, with "
+            "--watch-time until the slowest blade has stopped"
+        )
     return both
 
 
@@ -135,12 +154,12 @@ class RandomisationWork:
 
     def __call__(self, trial: Trial) -> Metrics:
         """Errors over the full trajectory on both test parts, distances from the stand-in [cm], and seconds."""
-        both = _both_once(self.plain, self.varied)
+        both = _both_once(self.plain, self.varied, self.recipe.known)
         splits = split_both(both, trial.seed)
         source = 0 if trial.setting == PLAIN else 1
-        known = NAMES if trial.setting == KNOWING else ()
+        known = self.recipe.known if trial.setting == KNOWING else ()
         config = replace(self.recipe.training, features=trial.features, known=known, seed=trial.seed)
-        inputs = _inputs_once(self.plain, self.varied, trial.features)
+        inputs = _inputs_once(self.plain, self.varied, self.recipe.known, trial.features)
         with thread_count(config.threads):
             started = perf_counter()
             predictor, _ = fit_predictor(both[source], config, splits[source], inputs=inputs[source])
@@ -153,12 +172,18 @@ class RandomisationWork:
                 if predictor.known:
                     errors = measure_errors(predictor, _nominal(test), test_inputs)
                     found[f"{name}_nominal_full"] = errors["full"]
-            shown = _shown_once(self.recipe.stand_in, self.recipe.repeats)
-            found |= distances(predictor, shown)
-            if predictor.known:
-                told = distances(predictor, shown, nominal=True)
-                found |= {f"{name}_nominal": value for name, value in told.items()}
+            if self.recipe.repeats:
+                found |= self._stand_in_distances(predictor)
         return found | {"train": len(splits[source].train), "seconds": seconds}
+
+    def _stand_in_distances(self, predictor: EffectPredictor) -> Metrics:
+        """Distances from the stand-in [cm], told the true and the usual values."""
+        shown = _shown_once(self.recipe.stand_in, self.recipe.repeats)
+        found = distances(predictor, shown)
+        if predictor.known:
+            told = distances(predictor, shown, nominal=True)
+            found |= {f"{name}_nominal": value for name, value in told.items()}
+        return found
 
 
 def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool = False) -> Metrics:
@@ -174,8 +199,9 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     batch = InteractionBatch.from_views(views, times)
     start: Float[np.ndarray, "batch 3"] = np.array([each.observed.com[0] for each in shown])
     told = [Physics(density=each.subject.density) if nominal else each.observed.physics for each in shown]
-    constants = {name: np.array([getattr(physics, name) for physics in told]) for name in NAMES}
-    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), **constants)
+    values = [true_values(physics, tuple(KNOWN)) for physics in told]
+    known = {name: np.array([each[name] for each in values]) for name in KNOWN}
+    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), **known)
     imagined = predictor.imagine_batch(batch).com
     values = np.array(
         [distance_until_slip(each.observed, times, path) for each, path in zip(shown, imagined, strict=True)]
@@ -224,9 +250,11 @@ def run_randomisation(
         raise ResultsError(f"seed {wrong[0]} is negative: choose seeds from 0")
     if workers < 1:
         raise ResultsError(f"workers is {workers}, it must be at least 1")
-    both = open_both(plain, varied)
+    both = open_both(plain, varied, recipe.known)
     identity: Mapping[str, Any] = {
-        "data": {name: fingerprint(batch, NAMES) for name, batch in zip((PLAIN, VARIED), both, strict=True)},
+        "data": {
+            name: fingerprint(batch, recipe.known) for name, batch in zip((PLAIN, VARIED), both, strict=True)
+        },
         "recipe": recipe.describe(),
     }
     trials = [
@@ -239,21 +267,22 @@ def run_randomisation(
 
 
 def _nominal(batch: InteractionBatch) -> InteractionBatch:
-    """The same interactions as if the usual constants were all that is known of them."""
-    return replace(batch, **{name: np.full(len(batch), getattr(Physics, name)) for name in NAMES})
+    """The same interactions as if the usual constants and the usual action were all that is known of them."""
+    usual = true_values(Physics(), tuple(KNOWN))
+    return replace(batch, **{name: np.full(len(batch), value) for name, value in usual.items()})
 
 
 @lru_cache(maxsize=1)
-def _both_once(plain: str, varied: str) -> Both:
+def _both_once(plain: str, varied: str, names: tuple[str, ...]) -> Both:
     """`open_both`, once per process."""
-    return open_both(plain, varied)
+    return open_both(plain, varied, names)
 
 
 @lru_cache(maxsize=4)
-def _inputs_once(plain: str, varied: str, label: str) -> tuple[Tensor, Tensor]:
+def _inputs_once(plain: str, varied: str, names: tuple[str, ...], label: str) -> tuple[Tensor, Tensor]:
     """Inputs of features for both data sets, once per process."""
     extractor = make_features(label)
-    first, second = (extractor.inputs(batch) for batch in _both_once(plain, varied))
+    first, second = (extractor.inputs(batch) for batch in _both_once(plain, varied, names))
     return first, second
 
 

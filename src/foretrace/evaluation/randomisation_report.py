@@ -27,20 +27,20 @@ NOMINAL = {
     "stand_in_printed": "stand_in_printed_nominal",
     "stand_in_everyday": "stand_in_everyday_nominal",
 }
-"""The same where a predictor that knows constants is told the usual ones."""
+"""The same where a predictor that knows what varies is told the usual values."""
 BARS = {
     "plain data": (PLAIN, False, GREY, ""),
     "randomised data": (VARIED, False, ORANGE, ""),
-    "randomised, true constants known": (KNOWING, False, BLUE, ""),
-    "randomised, told the usual constants": (KNOWING, True, GREEN, "///"),
+    "randomised, true values known": (KNOWING, False, BLUE, ""),
+    "randomised, told the usual values": (KNOWING, True, GREEN, "///"),
 }
-"""Predictors: what they learned from, whether they are told the usual constants, and how they are drawn."""
+"""Predictors: what they learned from, whether they are told the usual values, and how they are drawn."""
 CONTRASTS = {
     "randomised instead of plain": ("randomised data", "plain data"),
-    "constants known": ("randomised, true constants known", "randomised data"),
-    "usual constants instead of true ones": (
-        "randomised, told the usual constants",
-        "randomised, true constants known",
+    "true values known": ("randomised, true values known", "randomised data"),
+    "usual values instead of true ones": (
+        "randomised, told the usual values",
+        "randomised, true values known",
     ),
 }
 """Differences of two predictors of the same seed: the first less the second."""
@@ -52,6 +52,12 @@ def values_of(table: pd.DataFrame, features: str, bar: str, metric: str) -> pd.S
     wanted = NOMINAL[metric] if nominal else metric
     chosen = table["features"].eq(features) & table["setting"].eq(setting) & table["metric"].eq(wanted)
     return table.loc[chosen].set_index("seed")["value"].sort_index()
+
+
+def judges_of(table: pd.DataFrame) -> dict[str, str]:
+    """Those of JUDGES who judged: the stand-in can be left out."""
+    metrics = set(table["metric"])
+    return {judge: metric for judge, metric in JUDGES.items() if metric in metrics}
 
 
 def summarise(table: pd.DataFrame) -> dict[str, Any]:
@@ -66,7 +72,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     summary: dict[str, Any] = {}
     for features in dict.fromkeys(table["features"]):
         summary[features] = {}
-        for judge, metric in JUDGES.items():
+        for judge, metric in judges_of(table).items():
             values = {bar: values_of(table, features, bar, metric) for bar in BARS}
             differences = {
                 name: (values[first] - values[second]).dropna() for name, (first, second) in CONTRASTS.items()
@@ -119,13 +125,14 @@ def randomisation_figure(table: pd.DataFrame) -> Figure:
     ]
     fig.legend(handles=patches, loc="outside lower center", ncols=2, columnspacing=1.4)
     note = f"bars: means over {seeds_in_words(table)} with 95 % bootstrap intervals; dots: seeds"
-    finish(fig, "What randomised training data do for transfer", note)
+    finish(fig, "What randomised training data do, and what it helps to know what varies", note)
     return fig
 
 
 def _draw(ax: Axes, table: pd.DataFrame, features: str) -> None:
     width = 0.8 / len(BARS)
-    for place, metric in enumerate(JUDGES.values()):
+    judges = judges_of(table)
+    for place, metric in enumerate(judges.values()):
         for k, (bar, (_, _, color, hatch)) in enumerate(BARS.items()):
             values = values_of(table, features, bar, metric).to_numpy(float)
             if len(values) == 0:
@@ -138,6 +145,6 @@ def _draw(ax: Axes, table: pd.DataFrame, features: str) -> None:
             )
             ax.plot(np.full(len(values), at), values, "o", color=INK, markersize=2.2, alpha=0.7)
     grid(ax, ylim=(0, None), ylabel="error [cm]")
-    ax.set_xticks(range(len(JUDGES)), list(JUDGES))
+    ax.set_xticks(range(len(judges)), list(judges))
     ax.set_title(features, loc="left")
     ax.tick_params(axis="x", length=0)

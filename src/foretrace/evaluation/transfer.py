@@ -24,6 +24,7 @@ from foretrace.evaluation.transfer_objects import Played, Subject, play
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.known import true_values
 from foretrace.trajectories import warped_distance
 
 CM = 100.0
@@ -149,7 +150,7 @@ def compare(
     if len(observed.com) == 0:
         return row, np.empty((0, 3))
     physics = observed.physics if told is None else told
-    known = {name: getattr(physics, name) for name in predictor.known}
+    known = true_values(physics, predictor.known)
     start = predictor.imagine(view, observed.com[0], known)
     imagined = start.com_trajectory[_before(start.times, slip)]
     blind = predictor.imagine(view, known=known)
@@ -171,7 +172,7 @@ def own_error(predictor: EffectPredictor, view: TopDownView, simulated: Interact
     effect = simulated.effect
     if len(effect.times) == 0:
         return np.nan
-    known = {name: getattr(simulated.physics, name) for name in predictor.known}
+    known = true_values(simulated.physics, predictor.known, simulated.stroke)
     imagined = predictor.imagine(view, effect.com_trajectory[0], known).com_trajectory
     end = slice(None) if effect.slip_index is None else slice(max(1, effect.slip_index))
     return CM * warped_distance(effect.com_trajectory[end], imagined[end]).distance

@@ -57,6 +57,14 @@ class InteractionBatch:
     """Friction coefficient between object and table."""
     tool_friction: Float[np.ndarray, " batch"]
     """Friction coefficient between object and blade."""
+    insertion: Float[np.ndarray, " batch"]
+    """How far the blade was pushed under the object [m]."""
+    arc_radius: Float[np.ndarray, " batch"]
+    """Radius of the arc on which it was lifted [m]."""
+    sweep: Float[np.ndarray, " batch"]
+    """Angle of that arc [rad]."""
+    speed: Float[np.ndarray, " batch"]
+    """Times as fast as usual it moved."""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -113,9 +121,7 @@ class InteractionBatch:
             slip_index=np.zeros(n, dtype=np.int64),
             support_points=np.full((n, 2, 2), np.nan),
             outcome=np.full(n, "", dtype="<U8"),
-            density=unknown,
-            friction=unknown,
-            tool_friction=unknown,
+            **dict.fromkeys(_CONSTANTS, unknown),
         )
 
 
@@ -236,6 +242,8 @@ class Dataset:
         return self._objects[description]
 
 
+_CONSTANTS = ("density", "friction", "tool_friction", *storage.STROKE_COLUMNS)
+"""Columns of one number that a predictor may be told."""
 _VIEW_SHAPE = (storage.VIEW_SIZE, storage.VIEW_SIZE)
 
 
@@ -280,7 +288,7 @@ def _batch(table: pa.Table, objects: Mapping[str, ObjectModel]) -> InteractionBa
     times, length = _common_times(table)
     corners = _corners_in_action(table, objects)
     slip_index = table["slip_index"].to_numpy()
-    physics = {name: table[name].to_numpy() for name in ("density", "friction", "tool_friction")}
+    constants = {name: table[name].to_numpy() for name in _CONSTANTS}
     return InteractionBatch(
         ids=table["id"].to_numpy(),
         mask=storage.unpack_masks(table["mask"].to_pylist()),
@@ -295,5 +303,5 @@ def _batch(table: pa.Table, objects: Mapping[str, ObjectModel]) -> InteractionBa
         slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
         support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
         outcome=np.array(table["outcome"].to_pylist(), dtype="<U8"),
-        **physics,
+        **constants,
     )

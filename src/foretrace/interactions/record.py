@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import LeverUp
+from foretrace.actions import USUAL_STROKE, LeverUp, Stroke
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 
@@ -130,5 +130,7 @@ class Interaction:
     """Where it comes from."""
     misplacement: Misplacement = AS_TOLD
     """How far from what was told the blade acted."""
+    stroke: Stroke = USUAL_STROKE
+    """How deep, how far and how fast the blade went."""
     id: int = 0
     """Number within its data set."""

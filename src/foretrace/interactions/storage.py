@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from foretrace.actions import LeverUp
+from foretrace.actions import USUAL_STROKE, LeverUp, Stroke
 from foretrace.errors import DatasetError
 from foretrace.interactions.record import Effect, Interaction, Misplacement, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
@@ -63,6 +63,10 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "misplaced_ahead": (pa.float64(), "m", "how far ahead of the told contact the blade acted"),
     "misplaced_left": (pa.float64(), "m", "how far to the left of it"),
     "misplaced_turn": (pa.float64(), "rad", "by how much the blade pointed to the left of what was told"),
+    "insertion": (pa.float64(), "m", "how far the blade was pushed under the object"),
+    "arc_radius": (pa.float64(), "m", "radius of the arc on which the blade was lifted"),
+    "sweep": (pa.float64(), "rad", "angle of that arc"),
+    "speed": (pa.float64(), "", "times as fast as usual the blade was pushed in and lifted"),
     "source": (pa.string(), "", "simulated or recorded"),
     "engine": (pa.string(), "", "physics engine, empty for a recording"),
     "embodiment": (pa.string(), "", "arm or tool"),
@@ -77,11 +81,13 @@ ADDED_COLUMNS: dict[str, Any] = {
     "misplaced_ahead": 0.0,
     "misplaced_left": 0.0,
     "misplaced_turn": 0.0,
+    **asdict(USUAL_STROKE),
 }
 """Columns that older data sets lack, and what they would hold there."""
 OPTIONAL_COLUMNS = ("slip_index", "fall_index", "table_edge")
 """Numbers that may be null."""
 PHYSICS_COLUMNS = tuple(field.name for field in fields(Physics))
+STROKE_COLUMNS = tuple(field.name for field in fields(Stroke))
 MISPLACED = "misplaced_"
 """How the columns of a `Misplacement` begin."""
 SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
@@ -118,6 +124,7 @@ def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
         "metres_per_pixel": view.metres_per_pixel,
         **asdict(interaction.physics),
         **{MISPLACED + name: value for name, value in asdict(interaction.misplacement).items()},
+        **asdict(interaction.stroke),
         **asdict(interaction.provenance),
         "versions": json.dumps(interaction.provenance.versions, sort_keys=True),
     }
@@ -153,6 +160,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
             versions=json.loads(row["versions"]),
         ),
         misplacement=Misplacement(**{f.name: row[MISPLACED + f.name] for f in fields(Misplacement)}),
+        stroke=Stroke(**{name: row[name] for name in STROKE_COLUMNS}),
         id=row["id"],
     )
 

@@ -5,12 +5,16 @@ from collections.abc import Callable
 import numpy as np
 import shapely
 from jaxtyping import Float
+from scipy.spatial.distance import pdist
 
 from foretrace.objects.model import fitting_bevel
 from foretrace.objects.prism import CIRCLE_RADIUS, Prism, sample_prism
 
-HALF_LENGTHS = (0.04, 0.11)
-"""Smallest and largest half length of a sampled object [m]; of a prism the radius of its corners' circle."""
+HALF_LENGTHS = (0.04, 0.1)
+"""Smallest and largest half length of a sampled object [m]; of a prism the radius of its corners' circle.
+
+Longer objects would not fit into a view where they are levered at an end.
+"""
 HEIGHTS = (0.008, 0.04)
 """Smallest and largest height of a sampled flat object [m]."""
 DISC_SHARE = 1 / 3
@@ -113,6 +117,7 @@ def _flat(outline: shapely.Polygon, height: float) -> Prism:
     """The prism of an outline, around its centroid."""
     kept = shapely.simplify(outline, CURVE_TOLERANCE)
     corners = shapely.get_coordinates(kept)[:-1] - shapely.get_coordinates(shapely.centroid(kept))
+    corners *= min(1.0, 2 * HALF_LENGTHS[1] / pdist(corners).max())
     return Prism(corners, height, fitting_bevel(corners, height))
 
 

@@ -7,7 +7,7 @@ from importlib.metadata import version
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Stroke, ToolPath
 from foretrace.errors import PerceptionError
 from foretrace.geometry import continuous_quaternions, invert_transform, matrix_to_pose, transform_points
 from foretrace.interactions.film_folder import Frame
@@ -374,4 +374,6 @@ def _record(
     )
     versions = {name: version(name) for name in ("foretrace", "numpy")}
     provenance = Provenance(source="recorded", engine="", versions=versions)
-    return Interaction(obj, sight.action, sight.view, effect, provenance=provenance)
+    return Interaction(
+        obj, sight.action, sight.view, effect, provenance=provenance, stroke=Stroke.of(config.path)
+    )

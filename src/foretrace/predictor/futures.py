@@ -89,9 +89,9 @@ class Futures:
         """What may happen after the first samples were observed.
 
         An object that is not where it was expected, since the blade met it elsewhere, say, keeps that distance: all
-        that follows is moved and turned by it. What follows a slip forgets it, as it ends on the table. A future from which
-        the distance changes becomes less probable. Expected distances grow from the last observed sample on, as those
-        of a random walk, and more so the further that sample is off. Regions hold only roughly from then on.
+        that follows is moved and turned by it. What follows a slip forgets it, as it ends on the table. A future from
+        which the distance changes becomes less probable. Expected distances grow from the last observed sample on, as
+        those of a random walk, and more so the further that sample is off. Regions hold only roughly from then on.
 
         Args:
             observed: Positions in the action frame [m] and rotation vectors since rest [rad], from the start.

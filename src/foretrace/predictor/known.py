@@ -1,15 +1,31 @@
-"""Physical constants that a predictor may be told before the action, beside what it sees (paper, section 6)."""
+"""What a predictor may be told before the action beside what it sees: constants and parameters (paper, section 6)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 from jaxtyping import Float
 
+from foretrace.actions import USUAL_STROKE, Stroke
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.record import Physics
 
-KNOWN = {"friction": "of object and table", "tool_friction": "of object and blade", "density": "in kg/m^3"}
-"""What can be known, by the names of `Physics`."""
+CONSTANTS = {
+    "friction": "of object and table",
+    "tool_friction": "of object and blade",
+    "density": "in kg/m^3",
+}
+"""What can be known of the world, by the names of `Physics`."""
+PARAMETERS = {
+    "insertion": "in m",
+    "arc_radius": "in m",
+    "sweep": "in rad",
+    "speed": "as a multiple of the usual one",
+}
+"""What can be known of the action, by the names of `Stroke`."""
+KNOWN = CONSTANTS | PARAMETERS
+"""What can be known."""
 
 
 def check_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -41,6 +57,12 @@ def observed_values(batch: InteractionBatch, names: Sequence[str]) -> Float[np.n
             f"it out, or use a predictor that does not know {name}"
         )
     return values
+
+
+def true_values(physics: Physics, names: Sequence[str], stroke: Stroke = USUAL_STROKE) -> dict[str, float]:
+    """What holds of one lever-up, in SI units, by the given names."""
+    values = asdict(physics) | asdict(stroke)
+    return {name: values[name] for name in names}
 
 
 def given_values(values: Mapping[str, float] | None, names: Sequence[str]) -> Float[np.ndarray, "1 known"]:

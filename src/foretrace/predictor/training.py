@@ -60,7 +60,7 @@ class TrainConfig:
     residual: bool = True
     """Whether the network predicts changes of the state, instead of states as in the paper."""
     known: tuple[str, ...] = ()
-    """Physical constants that the predictor is told beside the view, by the names of `Physics`."""
+    """What the predictor is told beside the view, by the names of `Physics` and `Stroke`."""
     epochs: int = 15
     """Passes over the training part, unless ``min_steps`` asks for more."""
     min_steps: int = 300

@@ -111,8 +111,9 @@ def simulate_trial(config: CollectConfig, id: int) -> Interaction:
     rng = np.random.default_rng(
         np.random.SeedSequence([config.seed, *_locate(config, id), RANDOMISATION_STREAM])
     )
-    obj, physics, misplacement = config.randomisation.vary(obj, config.simulation.physics, rng)
-    simulation = replace(config.simulation, physics=physics)
+    physics, path = config.simulation.physics, config.simulation.path
+    obj, physics, path, misplacement = config.randomisation.vary(obj, physics, path, rng)
+    simulation = replace(config.simulation, physics=physics, path=path)
     return lever_up.simulate_lever_up(obj, action, simulation, seed=seed, id=id, misplacement=misplacement)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Stroke, ToolPath
 from foretrace.errors import SimulationError
 from foretrace.geometry import (
     continuous_quaternions,
@@ -163,6 +163,7 @@ def simulate_lever_up(
             versions=_versions(engine.library),
         ),
         misplacement=misplacement,
+        stroke=Stroke.of(config.path),
         id=id,
     )
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from foretrace.actions import CONTACT_TOLERANCE
+from foretrace.actions import CONTACT_TOLERANCE, ToolPath
 from foretrace.errors import SimulationError
 from foretrace.interactions.record import Misplacement, Physics
 from foretrace.objects import Bevel, Box, ObjectModel, Prism
@@ -51,6 +51,14 @@ class Randomisation:
     """It meets it up to this far to either side of there [m]."""
     misplaced_turn: float = 0.0
     """It points up to this far to either side of where it was told to [rad]."""
+    insertion: Range | None = None
+    """How far the blade is pushed under the object [m]; None leaves the configured path."""
+    arc_radius: Range | None = None
+    """Radii of the arc on which it lifts [m]."""
+    sweep: Range | None = None
+    """Angles of that arc [rad]."""
+    speed: Range | None = None
+    """Times as fast as configured. The blade rests at the end until the slowest would be there, too."""
 
     def __post_init__(self) -> None:
         for name in RANGES:
@@ -69,17 +77,19 @@ class Randomisation:
                 )
 
     def vary(
-        self, obj: ObjectModel, physics: Physics, rng: np.random.Generator
-    ) -> tuple[ObjectModel, Physics, Misplacement]:
-        """One lever-up's object, constants and misplacement.
+        self, obj: ObjectModel, physics: Physics, path: ToolPath, rng: np.random.Generator
+    ) -> tuple[ObjectModel, Physics, ToolPath, Misplacement]:
+        """One lever-up's object, constants, path and misplacement.
 
         Args:
             obj: The object as configured.
             physics: Friction and density as configured.
+            path: The blade's path as configured.
             rng: What is drawn from: always one number for each setting, in their order.
 
         Raises:
             ShapeError: A thinner object or a wider bevel leaves no bottom face.
+            ActionError: No path goes so deep, so far or so fast.
         """
         shares = dict(zip((field.name for field in fields(self)), rng.random(len(fields(self))), strict=True))
         drawn = {
@@ -90,14 +100,25 @@ class Randomisation:
         ahead, left, turn = (float(getattr(self, name) * (2 * shares[name] - 1)) for name in LARGEST)
         constants = {name: drawn[name] for name in CONSTANTS if name in drawn}
         factors = [drawn.get(name, 1.0) for name in FACTORS]
-        return reshaped(obj, *factors), replace(physics, **constants), Misplacement(ahead, left, turn)
+        path = replace(path, **{name: drawn[name] for name in PATH if name in drawn})
+        if self.speed is not None:
+            path = _sped_up(path, drawn["speed"], slowest=self.speed[0])
+        return reshaped(obj, *factors), replace(physics, **constants), path, Misplacement(ahead, left, turn)
+
+
+def _sped_up(path: ToolPath, speed: float, slowest: float) -> ToolPath:
+    """A path so many times as fast, with a rest that makes it end when the slowest one does."""
+    rest = path.faster(slowest).duration - path.faster(speed).duration
+    return replace(path.faster(speed), hold_time=path.hold_time + rest)
 
 
 CONSTANTS = ("friction", "tool_friction", "density")
 """What is drawn of `Physics`."""
 FACTORS = ("thickness_factor", "bevel_width_factor", "bevel_height_factor")
 """What is drawn of the object's shape."""
-RANGES = CONSTANTS + FACTORS
+PATH = ("insertion", "arc_radius", "sweep")
+"""What is drawn of the blade's path, as it stands in `ToolPath`."""
+RANGES = (*CONSTANTS, *FACTORS, *PATH, "speed")
 NOTHING = Randomisation()
 """Every lever-up as told."""
 RANDOMISED = Randomisation(
@@ -113,6 +134,14 @@ RANDOMISED = Randomisation(
 )
 """What ``foretrace simulate --randomise`` draws from: around the usual constants, as wide as a robot's owner might be
 wrong about a slab of wood or plastic, a steel blade and a calibrated camera."""
+
+VARIED_ACTION = {
+    "insertion": (0.012, 0.03),
+    "arc_radius": (0.10, 0.18),
+    "sweep": (0.45, 1.0),
+    "speed": (2 / 3, 1.5),
+}
+"""What ``foretrace simulate --vary-action`` draws from: around the usual path, within the arm's reach and speed."""
 
 
 def reshaped(obj: ObjectModel, thickness: float, bevel_width: float, bevel_height: float) -> ObjectModel:
