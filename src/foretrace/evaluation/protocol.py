@@ -94,6 +94,23 @@ def _share_of_all(batch: InteractionBatch, setting: str, seed: int, proportional
     return Split(train=np.sort(parts[1]), validation=np.sort(parts[0]), test=np.sort(parts[2]))
 
 
+def _count_of_all(batch: InteractionBatch, setting: str, seed: int, proportional: bool) -> Split:
+    """So many train, and 100 validate and 300 test, the same for all; the smaller part is part of the larger."""
+    _, validation, test = scaled_sizes(len(batch)) if proportional else PAPER_SIZES
+    if (needed := int(setting) + validation + test) > len(batch):
+        raise ResultsError(
+            f"setting {setting} needs {needed} levered interactions, the data has {len(batch)}: simulate more objects, "
+            "or choose smaller settings"
+        )
+    order = np.random.default_rng(seed).permutation(len(batch))
+    ends = np.cumsum([validation, test, int(setting)])
+    return Split(
+        train=np.sort(order[ends[1] : ends[2]]),
+        validation=np.sort(order[: ends[0]]),
+        test=np.sort(order[ends[0] : ends[1]]),
+    )
+
+
 def _novel_corners(batch: InteractionBatch, setting: str, seed: int, proportional: bool) -> Split:
     return split_by_corner_count(batch.num_corners, [int(count) for count in setting.split("&")], seed)
 
@@ -135,6 +152,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "training-size": Experiment((*_ALL, ONE_SHOT), ("2", "4", "8", "16", "32", "64"), _share_of_all),
     "steps-ahead": Experiment(_ALL, ("2", "3", "4", "5"), _shuffled, varies_steps=True),
     "novel-corners": Experiment((*_ALL, ONE_SHOT), _CORNERS, _novel_corners),
+    "more-data": Experiment(("none", ONE_SHOT), ("2000", "5000", "10000", "20000"), _count_of_all),
     "ablation": Experiment(tuple(_ABLATIONS), ("shuffled",), _shuffled),
 }
 """The paper's comparisons by name: figures 9a, 9b, 10, 11, 12 and 13.
@@ -143,7 +161,8 @@ Two ask what our choices change: in ``support-points-plain`` the network sees co
 points as they are, and the rule lifts at the contact point; ``half-plane`` counts only what of an outline lies ahead of
 the levered edge.
 
-``ablation`` takes parts away from the predictor of whole motions.
+``more-data`` goes on from there with a data set of more objects than the paper's. ``ablation`` takes parts away from the
+predictor of whole motions.
 
 One state ahead, the first setting of figure 12, is ``features`` ``shuffled``.
 """
