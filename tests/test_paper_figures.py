@@ -140,6 +140,19 @@ def test_figures_command(tmp_path, capsys):
     assert (tmp_path / "elsewhere" / "figure-9a.png").is_file()
 
 
+def test_figures_command_with_several_folders(tmp_path, capsys):
+    table = paper_like(num_seeds=1)
+    parts = {name: table[table["experiment"] == name] for name in ("support-points", "features")}
+    folders = [str(results_folder(tmp_path / name, part)) for name, part in parts.items()]
+    assert cli.main(["figures", *folders]) == 0
+    drawn = {path.name for path in (tmp_path / "support-points" / "figures").iterdir()}
+    assert {"figure-9a.png", "figure-10a.png"} <= drawn
+    assert cli.main(["figures", *folders, folders[0]]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("foretrace: error: support-points, ")
+    assert error.endswith("is in two folders: leave one out")
+
+
 def test_figures_command_without_results(tmp_path, capsys):
     assert cli.main(["figures", str(tmp_path / "nowhere")]) == 2
     printed = capsys.readouterr()

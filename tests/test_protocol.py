@@ -158,12 +158,14 @@ def paper_batch():
 @pytest.mark.parametrize("proportional", [False, True])
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_no_trial_is_tested_on_what_it_learned_from(name, proportional, paper_batch):
+    if EXPERIMENTS[name].on_request:  # of more data than the paper's
+        paper_batch = paper_batch[np.arange(26_000) % len(paper_batch)]
     for chosen in plan([name], seeds=[0, 3]):
         split = split_of(chosen, paper_batch, proportional)
         parts = [set(split.train), set(split.validation), set(split.test)]
         assert all(parts)
         assert sum(map(len, parts)) == len(set.union(*parts))
-        assert set.union(*parts) <= set(range(1814))
+        assert set.union(*parts) <= set(range(len(paper_batch)))
         if chosen.setting == "by-object":
             objects = [set(paper_batch.object_ids[list(part)]) for part in parts]
             assert sum(map(len, objects)) == len(set.union(*objects))
@@ -190,8 +192,20 @@ def test_smaller_training_parts_are_within_larger_ones(name, paper_batch):
         assert {len(split.test) for split in splits} == {300}
 
 
+def test_more_data_is_tested_on_the_same_interactions(paper_batch):
+    many = paper_batch[np.arange(20_400) % len(paper_batch)]
+    splits = [split_of(Trial("more-data", "none", 5, s), many) for s in EXPERIMENTS["more-data"].settings]
+    assert [len(split.train) for split in splits] == [2000, 5000, 10000, 20000]
+    for smaller, larger in pairwise(splits):
+        assert set(smaller.train) < set(larger.train)
+        assert (len(smaller.validation), len(smaller.test)) == (100, 300)
+        np.testing.assert_array_equal(smaller.test, larger.test)
+    with pytest.raises(ResultsError, match="setting 2000 needs 2400 levered interactions, the data has 1814"):
+        split_of(Trial("more-data", "none", 0, "2000"), paper_batch)
+
+
 def test_seeds_draw_other_parts(paper_batch):
-    for name in EXPERIMENTS:
+    for name in [name for name, experiment in EXPERIMENTS.items() if not experiment.on_request]:
         first, second = plan([name], seeds=[0, 1])[0], plan([name], seeds=[1])[0]
         parts = (split_of(t, paper_batch).train.tolist() for t in (first, second))
         assert len({tuple(part) for part in parts}) == 2, name

@@ -7,21 +7,31 @@ from tyro.conf import Positional
 from foretrace.cli.console import say
 
 
-def figures(results: Positional[Path], out: Path | None = None) -> None:
-    """Draw the paper's figures from a table of results, and test the paper's claims on it.
+def figures(results: Positional[tuple[Path, ...]], out: Path | None = None) -> None:
+    """Draw the paper's figures from tables of results, and test the paper's claims on them.
 
     Nothing is trained. Figures that there are no results for yet are left out.
 
     Args:
-        results: Folder of the results.
-        out: Folder for figures, claims and summary; by default ``figures`` in the results' folder.
+        results: Folder of the results; or several, that are put together.
+        out: Folder for figures, claims and summary; by default ``figures`` in the first folder.
     """
+    import pandas as pd
+
+    from foretrace.errors import ResultsError
     from foretrace.evaluation.claims import judge_claims, write_claims
     from foretrace.evaluation.paper_figures import write_figures
     from foretrace.evaluation.results import read_results
 
-    table = read_results(results)
-    out = out or results / "figures"
+    if not results:
+        raise ResultsError("no folder of results: give at least one")
+    table = pd.concat([read_results(folder) for folder in results], ignore_index=True)
+    if (twice := table.duplicated(["experiment", "features", "seed", "setting", "metric"])).any():
+        row = table[twice].iloc[0]
+        raise ResultsError(
+            f"{row.experiment}, {row.features}, seed {row.seed}, setting {row.setting} is in two folders: leave one out"
+        )
+    out = out or results[0] / "figures"
     paths = write_figures(table, out, report=say) + write_claims(table, out)
     _print_claims(judge_claims(table))
     for path in paths:
