@@ -16,6 +16,8 @@ CONTACT_TOLERANCE = 0.005
 """A contact may lie this far from the outline, as when it was measured with an error [m]."""
 APPROACH = (0.0035, 0.002, 0.3)
 """What must be free before a sampled contact: this far to either side, from so near to so far away [m]."""
+BEHIND = 0.085
+"""The view from above ends a little farther behind the contact than this [m]."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -140,7 +142,7 @@ def sample_reachable_contacts(obj: ObjectModel, rng: np.random.Generator, count:
     """Lever-ups uniformly over the length of an outline, wherever a blade gets there straight from outside.
 
     For outlines of many short edges, of which each would be too many; and for dents, of which the narrow ones have
-    no room for a blade.
+    no room for a blade. Nothing of the object lies more than ``BEHIND`` behind the contact.
     """
     starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
     lengths = np.linalg.norm(stops - starts, axis=1)
@@ -154,7 +156,8 @@ def sample_reachable_contacts(obj: ObjectModel, rng: np.random.Generator, count:
             rng.uniform(np.nextafter(0.0, 1.0), 1.0),
         )
         way = [action.contact - distance * action.direction for distance in (near, far)]
-        if not shapely.intersects(outline, shapely.LineString(way).buffer(side, cap_style="flat")):
+        free = not shapely.intersects(outline, shapely.LineString(way).buffer(side, cap_style="flat"))
+        if free and ((obj.corners - action.contact) @ action.direction).min() > -BEHIND:
             actions.append(action)
     return actions
 
