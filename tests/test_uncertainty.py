@@ -244,15 +244,21 @@ def test_the_command_goes_on_from_what_is_there(folder, tmp_path, monkeypatch, c
     kept = uncertainty.train(batch, out / "trainings" / "shuffled-1", 1, split, config) / "metrics.csv"
     first = kept.stat().st_mtime_ns
     command = ["evaluate", "uncertainty", "--data", str(folder), "--out", str(out), "--seeds", "1"]
+    command += ["--unlike", str(folder)]
     assert main([*command, "--epochs", "1", "--samples", "3", "--held-out", "5"]) == 0
     assert kept.stat().st_mtime_ns == first
     assert "## Novel shapes, seeds 1" in capsys.readouterr().out
     rows = pd.read_csv(out / "rows.csv")
     assert list(rows) == ["seed", "split", "metric", "group", "level", "value"]
     predictor = load_predictor(kept.parent)
-    again = uncertainty.measure(predictor, batch, split, 1, samples=3)
+    again = uncertainty.measure(predictor, batch, split, 1, samples=3, unlike=batch)
     mine = rows.loc[rows["split"].eq("shuffled"), list(again)].reset_index(drop=True)
     pd.testing.assert_frame_equal(mine, again, rtol=1e-4)
+    # All of the other data are judged, and only once.
+    other = rows.loc[rows["metric"].eq("unlike_record_rest_count") & rows["level"].eq(0)]
+    assert set(other["split"]) == {"shuffled"}
+    assert other.loc[other["group"].eq("all"), "value"].tolist() == [len(batch)]
+    assert "### The same of lever-ups with other physics" in (out / "uncertainty.md").read_text()
     novel = rows.loc[rows["split"].eq("novel-shapes") & rows["metric"].str.startswith("count_")]
     assert novel.loc[novel["metric"].eq("count_test"), "value"].sum() == (batch.num_corners == 5).sum()
     assert novel["value"].sum() == len(batch)
@@ -292,6 +298,13 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys, options, message):
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_other_physics_are_judged_at_the_same_times(batch):
+    predictor = replace(QUICK, outcomes=("levered", "slipped")).make_predictor(20)
+    split, late = uncertainty.split_of(batch, "shuffled", 0), replace(batch, times=2 * batch.times)
+    with pytest.raises(DatasetError, match=r"samples up to .* s, those learned from .*: simulate both"):
+        uncertainty.measure(predictor, batch, split, 0, samples=2, unlike=late)
 
 
 def test_data_without_motions_are_refused(tmp_path):

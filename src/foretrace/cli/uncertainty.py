@@ -18,6 +18,7 @@ def evaluate_uncertainty(
     held_out: tuple[int, ...] = (5, 6),
     epochs: int | None = None,
     samples: int = 100,
+    unlike: Path | None = None,
     threads: int = 1,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> None:
@@ -35,6 +36,8 @@ def evaluate_uncertainty(
         held_out: Corner counts of the novel shapes.
         epochs: Passes over the training part, as in `foretrace train`.
         samples: Motions drawn at random for each interaction.
+        unlike: Folder of a data set with other physics, sampled at the same times, for instance simulated with
+            `--randomise`. What observed beginnings are worth is judged on it, too, for shuffled splits.
         threads: Threads of PyTorch.
         device: Where to train.
     """
@@ -57,6 +60,7 @@ def evaluate_uncertainty(
     config = replace(experiment.RECIPE, threads=threads, device=device)
     config = config if epochs is None else replace(config, epochs=epochs)
     batch = experiment.load(data)
+    other = None if unlike is None else experiment.load(unlike)
     parts = {
         (setting, seed): experiment.split_of(batch, setting, seed, held_out)
         for setting in dict.fromkeys(splits)
@@ -72,7 +76,9 @@ def evaluate_uncertainty(
         )
         assert isinstance(predictor, OneShotPredictor)
         with thread_count(threads):
-            rows = experiment.measure(predictor, batch, split, seed, samples)
+            rows = experiment.measure(
+                predictor, batch, split, seed, samples, other if setting == "shuffled" else None
+            )
         rows.insert(0, "split", setting)
         rows.insert(0, "seed", seed)
         tables.append(rows)

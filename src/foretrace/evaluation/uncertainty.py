@@ -15,6 +15,7 @@ import pandas as pd
 
 from foretrace.errors import DatasetError
 from foretrace.evaluation.uncertainty_metrics import (
+    UNLIKE,
     Part,
     futures_of,
     judge_errors,
@@ -85,7 +86,12 @@ def train(
 
 
 def measure(
-    predictor: OneShotPredictor, batch: InteractionBatch, split: Split, seed: int, samples: int = 100
+    predictor: OneShotPredictor,
+    batch: InteractionBatch,
+    split: Split,
+    seed: int,
+    samples: int = 100,
+    unlike: InteractionBatch | None = None,
 ) -> pd.DataFrame:
     """All that is to be told about one predictor.
 
@@ -95,6 +101,8 @@ def measure(
         split: Those of its training. The validation part fits the forecasts that its samples are compared with.
         seed: Seed of the samples.
         samples: Motions drawn at random for each interaction.
+        unlike: Interactions with other physics than those learned from, with the same sample times. Of these, only what
+            observed samples are worth is judged; their metrics begin with `UNLIKE`.
 
     Returns:
         ``metric``, ``group`` (`uncertainty_metrics.ALL` or an outcome; of ``confusion``, what happened and what was
@@ -118,4 +126,13 @@ def measure(
         for metric, values in score(drawn, test.com, test.valid).items():
             found += test.means(f"{name}_{metric}", values)
     found += judge_observed(predictor, test)
+    if unlike is not None:
+        if not np.array_equal(unlike.times, batch.times):
+            raise DatasetError(
+                f"the interactions unlike those learned from have {len(unlike.times)} samples up to "
+                f"{unlike.times[-1]:g} s, those learned from {len(batch.times)} up to {batch.times[-1]:g} s: simulate "
+                "both with the same settings"
+            )
+        other = Part.of(predictor, unlike[np.isin(unlike.outcome, predictor.outcomes)])
+        found += [(UNLIKE + metric, *row) for metric, *row in judge_observed(predictor, other)]
     return pd.DataFrame(found, columns=["metric", "group", "level", "value"])

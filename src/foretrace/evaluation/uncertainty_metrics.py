@@ -24,6 +24,8 @@ MOVED = 0.001
 """An object moves once its centre of mass is so far from where it was at rest [m]."""
 BEGINNINGS = ("record", "moving")
 """From where observed samples are counted: the record's start, or the first sample of an object that moves."""
+UNLIKE = "unlike_"
+"""Begins the names of metrics of interactions with other physics than those learned from."""
 ALL = "all"
 """The group of all interactions; others are named like their outcomes."""
 CM = 100.0

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from foretrace.evaluation.statistics import mean_interval
-from foretrace.evaluation.uncertainty_metrics import ALL, BEGINNINGS, OBSERVED, SHOWN_LEVELS
+from foretrace.evaluation.uncertainty_metrics import ALL, BEGINNINGS, OBSERVED, SHOWN_LEVELS, UNLIKE
 from foretrace.evaluation.uncertainty_scores import FORECASTS, SCORES
 from foretrace.predictor.one_shot import FEW
 
@@ -85,6 +85,9 @@ def markdown(summary: Mapping[str, Any]) -> str:
         parts += ["### Regions", *_regions(values)]
         parts += ["### Scores of samples; less is better", _scores(values)]
         parts += ["### The rest of the motion, after some samples were observed", *_observed(values)]
+        if f"{UNLIKE}{BEGINNINGS[0]}_rest" in values:
+            parts += ["### The same of lever-ups with other physics than those learned from"]
+            parts += _observed(values, UNLIKE)
     return "\n\n".join(parts) + "\n"
 
 
@@ -145,9 +148,10 @@ def _scores(values: Mapping[str, Any]) -> str:
     return _table(lines)
 
 
-def _observed(values: Mapping[str, Any]) -> list[str]:
+def _observed(values: Mapping[str, Any], prefix: str = "") -> list[str]:
     found = []
-    for beginning in BEGINNINGS:
+    for name in BEGINNINGS:
+        beginning = prefix + name
         levels = [f"{k}" for k in OBSERVED if f"{k}" in values[f"{beginning}_rest"].get(ALL, {})]
         lines = [["Observed samples", *levels]]
         for group in values[f"{beginning}_rest"]:
@@ -157,7 +161,7 @@ def _observed(values: Mapping[str, Any]) -> list[str]:
                 lines.append([f"{_name(group)}, {words}", *cells])
         scores = values[f"{beginning}_macro_f1"][ALL]
         lines.append(["Macro-F1 of outcomes", *(_cell(scores.get(level), 3) for level in levels)])
-        found += [f"Samples counted {WORDS[beginning]}:", _table(lines)]
+        found += [f"Samples counted {WORDS[name]}:", _table(lines)]
     return found
 
 
