@@ -4,6 +4,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+import shapely
 import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
@@ -14,7 +15,7 @@ from foretrace.features.outline import fit_hull
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import Prism
-from foretrace.predictor.hinges import find_hinges
+from foretrace.predictor.hinges import NUM_VALUES, RIM, find_hinges
 
 CORNERS = np.array(
     [[0.055, -0.045], [0.075, 0.012], [0.03, 0.055], [-0.03, 0.045], [-0.06, -0.01], [-0.035, -0.05]]
@@ -70,6 +71,9 @@ def _pixels(ax, view: TopDownView, hull: np.ndarray) -> None:
 
 def _hinges(ax, hull: np.ndarray, com: np.ndarray, hinges) -> None:
     ax.add_patch(Polygon(hull[:, ::-1] * [-1, 1], facecolor=OBJECT_COLOR, alpha=0.3, edgecolor=OBJECT_EDGE))
+    bottom = shapely.get_coordinates(shapely.Polygon(hull).buffer(-RIM, join_style="mitre"))
+    ax.plot(-bottom[:, 1], bottom[:, 0], color=OBJECT_EDGE, lw=1, ls=(0, (1, 1.5)))
+    ax.text(-0.046, 0.018, "bottom face", color=OBJECT_EDGE, fontsize=9, ha="right")
     lift = np.array([-SETBACK, HALF_WIDTH * np.sign(com[1])])
     ray = com[:2] - lift
     end = com[:2] + 0.75 * ray
@@ -88,7 +92,7 @@ def _hinges(ax, hull: np.ndarray, com: np.ndarray, hinges) -> None:
         spot = at + 0.034 * out
         ax.text(-spot[1], spot[0], name, color=color, fontsize=10, ha="center", va="bottom")
     _blade(ax)
-    _frame(ax, "2  Two hinges, 19 numbers each")
+    _frame(ax, f"2  Two hinges, {NUM_VALUES} numbers each")
 
 
 def _futures(ax) -> None:
