@@ -295,20 +295,14 @@ def main() -> None:
             "versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__},
             "run": str(options.run),
         }
-        options.out.write_text(
-            json.dumps(
-                content
-                | {
-                    "summary": summary,
-                    "judging": judged,
-                    "films": rows,
-                    "stills": stills,
-                    "refused": refused,
-                },
-                indent=1,
-            )
-            + "\n"
-        )
+        content |= {
+            "summary": summary,
+            "judging": judged,
+            "films": rows,
+            "stills": stills,
+            "refused": refused,
+        }
+        options.out.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":
