@@ -89,7 +89,7 @@ def measure_still(root: Path, number: int) -> dict:
 
 
 def summarise_stills(stills: list[dict]) -> dict:
-    summary: dict = {"stills": len(stills)}
+    summary: dict = {"count": len(stills)}
     for how in ("background", "depth"):
         overlaps = np.array([still[f"iou_{how}"] for still in stills])
         summary |= {
@@ -288,7 +288,7 @@ def main() -> None:
     }
     judged = None if options.data is None else judge_simulated(options.data)
     stills = [measure_still(options.films / "stills", 100 + k) for k in range(options.stills)]
-    summary |= summarise_stills(stills) if stills else {}
+    summary["stills"] = summarise_stills(stills) if stills else None
     print(json.dumps({"summary": summary, "judging": judged}, indent=1))
     if options.out is not None:
         content = {

@@ -73,6 +73,7 @@ def test_recordings_are_learned_from_and_judged_like_simulations(
     assert main(["overlay", str(recorded), "0", "--run", str(tmp_path / "run"), "--out", str(video)]) == 0
     shown, film = list(open_film(video).frames()), list(open_film(recorded.parent / "film-0").frames())
     assert len(shown) == len(film)
+    assert (tmp_path / "overlay-side.png").stat().st_size > 1000
     changed = np.abs(shown[-1].picture.astype(int) - film[-1].picture).max(axis=2) > 80
     assert 100 < changed.sum() < 0.1 * changed.size
     assert main(["overlay", str(recorded), "9", "--run", str(tmp_path / "run"), "--out", str(video)]) == 2

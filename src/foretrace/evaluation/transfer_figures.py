@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -184,7 +185,7 @@ def paths_figure(
         fig = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
         cells = fig.subplots(lines, columns, squeeze=False).ravel()
         for ax, example in zip(cells, examples, strict=False):
-            draw_paths(ax, example)
+            draw_example(ax, example)
         for ax in cells[len(examples) :]:
             ax.axis("off")
         handles = [
@@ -198,24 +199,49 @@ def paths_figure(
     return fig
 
 
-def draw_paths(ax: Axes, example: Example) -> None:
-    """One contact's paths in the x-z plane of the action frame, up to the first slip; scales in cm."""
+def side_figure(
+    observed: Float[np.ndarray, "time 3"], predicted: Float[np.ndarray, "later 3"], title: str
+) -> Figure:
+    """Observed and predicted path of one recording from the side (paper, figure 14, last panel).
+
+    Args:
+        observed: Centre of mass in the action frame [m].
+        predicted: The same as it was imagined.
+        title: What the recording is called.
+    """
+    with mpl.rc_context(STYLE):
+        fig = Figure(figsize=(6.4, 6.4), dpi=DPI, layout="constrained")
+        ax = fig.subplots()
+        draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
+        ax.legend(loc="upper left")
+        finish(fig, "Paths of the centre of mass from the side", "The table is grey")
+    return fig
+
+
+def draw_example(ax: Axes, example: Example) -> None:
+    """One contact's paths from the side, up to the first slip."""
     effect, observed = example.simulated.effect, example.observed
     end = effect.slip_index
     if observed.slip_time is not None:
         slip = int(np.searchsorted(effect.times, observed.slip_time))
         end = slip if end is None else min(end, slip)
+    slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
     paths = {
         "observed": observed.com,
         "predicted": example.imagined,
         "simulated": effect.com_trajectory[:end],
     }
+    draw_paths(ax, paths, f"{example.name}, contact {example.contact}{slipped}")
+
+
+def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: str) -> None:
+    """Paths [m] by what they are, in the x-z plane of the action frame; scales in cm."""
     for name, path in paths.items():
         color, style, width = PATHS[name]
-        ax.plot(path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=5)
-        ax.plot(path[-1:, 0] * CM, path[-1:, 2] * CM, "o", color=color, markersize=4.5, zorder=6)
-    slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
-    ax.set_title(f"{example.name}, contact {example.contact}{slipped}")
+        x, z = path[:, 0] * CM, path[:, 2] * CM
+        ax.plot(x, z, color=color, linestyle=style, linewidth=width, zorder=5, label=name)
+        ax.plot(x[-1:], z[-1:], "o", color=color, markersize=4.5, zorder=6)
+    ax.set_title(title)
     seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
     (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
     middle = (left + right) / 2

@@ -316,6 +316,8 @@ def object_height(
 
 def _inside(point: tuple[float, float], shape: tuple[int, ...]) -> tuple[int, int]:
     """A point's nearest pixel (column, row)."""
+    if not np.isfinite(point).all():
+        raise PerceptionError(f"point ({point[0]:g}, {point[1]:g}) is no pixel: give column and row")
     column, row = round(point[0]), round(point[1])
     if not (0 <= column < shape[1] and 0 <= row < shape[0]):
         raise PerceptionError(
