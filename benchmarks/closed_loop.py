@@ -1,14 +1,16 @@
 """The way from camera to prediction, proved against simulated films: calibrate, see, track, import, predict.
 
 Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 10] [--data data/paper]
-       [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
+       [--stills 96] [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
 
-Films are made once and kept. Everything after that sees pictures, time stamps and the marker layout alone; the truth
+Films are made once and kept. Stills are first frames of further lever-ups: of these, views alone are compared, with the
+camera known exactly. Everything after that sees pictures, time stamps and the marker layout alone; the truth
 is opened only to compare.
 """
 
 import argparse
 import json
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -32,6 +34,7 @@ from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
 from foretrace.perception.views import Sight, contact_at_pixel, place_object, see
 from foretrace.predictor import load_predictor
 from foretrace.simulation.film import FilmConfig, film_board, film_lever_up
+from foretrace.simulation.lens import WEBCAM
 from foretrace.trajectories import mean_distance, warped_distance
 
 HEIGHT = 0.02
@@ -64,22 +67,62 @@ def make_films(root: Path, num: int) -> None:
             print(f"filmed {folder}", flush=True)
 
 
+def measure_still(root: Path, number: int) -> dict:
+    """How well the first frame of a lever-up shows the view, the camera's pose and lens being known."""
+    folder, (obj, action), config = root / f"{number}", subject(number), film_config(number)
+    if not (folder / "truth.json").is_file():
+        # One frame, before the blade moves.
+        short = 1.5 / config.frames_per_second - config.lead_time - config.simulation.path.duration
+        film_lever_up(obj, action, folder, replace(config, tail_time=short, depth_every=1), seed=number)
+    truth = json.loads((folder / "truth.json").read_text())
+    T_table_camera = np.array(truth["T_table_camera"])
+    T_table_object = pose_to_matrix(np.array(truth["object_poses_in_table"][:1]))[0]
+    rim = transform_points(T_table_object, np.array([[*action.contact, obj.height]]))
+    column, row = WEBCAM.project(rim, invert_transform(T_table_camera))[0]
+    exact, result = TopDownView.of(obj, action), {"still": number, "corners": len(obj.corners)}
+    for how in ("background", "depth"):
+        sight = sight_of(folder, T_table_camera, WEBCAM, (float(column), float(row)), how)
+        turn = rotation_angle(sight.T_table_action[:3, :3], np.array(truth["T_table_action"])[:3, :3])
+        result |= {f"iou_{how}": overlap(sight.view, exact), f"turn_{how}_deg": float(np.rad2deg(turn))}
+        result[f"corners_{how}"] = len(sight.placed.object.corners)
+    return result
+
+
+def summarise_stills(stills: list[dict]) -> dict:
+    summary: dict = {"count": len(stills)}
+    for how in ("background", "depth"):
+        overlaps = np.array([still[f"iou_{how}"] for still in stills])
+        summary |= {
+            f"iou_{how}_median": float(np.median(overlaps)),
+            f"iou_{how}_min": float(overlaps.min()),
+            f"iou_{how}_below_0.98": int((overlaps < 0.98).sum()),
+            f"turn_{how}_max_deg": max(still[f"turn_{how}_deg"] for still in stills),
+            f"corners_right_{how}": sum(still["corners"] == still[f"corners_{how}"] for still in stills),
+        }
+    return summary
+
+
 def sight_of(
-    folder: Path, found: Imported, camera: PinholeCamera, pixel: tuple[float, float], how: str
+    folder: Path,
+    T_table_camera: np.ndarray,
+    camera: PinholeCamera,
+    pixel: tuple[float, float],
+    how: str,
 ) -> Sight:
     """What the first frame alone shows of an object of unknown shape."""
     frame = next(open_film(folder).frames())
     if how == "depth":
         assert frame.depth is not None
-        heights = masks.heights_above_table(frame.depth, camera, found.T_table_camera)
+        heights = masks.heights_above_table(frame.depth, camera, T_table_camera)
         mask = masks.pick_object(masks.mask_by_height(heights), pixel)
         height, rim = masks.object_height(heights, mask), 0.008
     else:
         background = read_picture(folder / "background.png")
-        mask = masks.pick_object(masks.mask_by_background(frame.picture, background), pixel)
+        cover = masks.cover_by_background(frame.picture, background)
+        mask = masks.cover_of(cover, masks.pick_object(cover > 0.5, pixel))
         height, rim = HEIGHT, 0.003
-    placed = place_object(mask, camera, found.T_table_camera, height, rim, hull=True)
-    return see(placed, contact_at_pixel(placed, pixel, camera, found.T_table_camera))
+    placed = place_object(mask, camera, T_table_camera, height, rim, hull=True)
+    return see(placed, contact_at_pixel(placed, pixel, camera, T_table_camera))
 
 
 def overlap(a: TopDownView, b: TopDownView) -> float:
@@ -125,7 +168,7 @@ def measure(folder: Path, camera: PinholeCamera, predictor, picture: Path | None
     end = len(grid) if slip is None else min(slip, len(grid))
     result["error_exact_cm"] = 100 * float(mean_distance(imagined.com_trajectory[:end], path[:end]))
     for how in ("background", "depth"):
-        sight = sight_of(folder, found, camera, (float(column), float(row)), how)
+        sight = sight_of(folder, found.T_table_camera, camera, (float(column), float(row)), how)
         seen = predictor.imagine(sight.view, sight.com_in_action)
         # In the table frame: an action frame that was seen askew counts as an error of the prediction.
         in_table = transform_points(sight.T_table_action, seen.com_trajectory)
@@ -197,6 +240,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--films", type=Path, default=Path("build/films"))
     parser.add_argument("--num", type=int, default=10)
+    parser.add_argument("--stills", type=int, default=0)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--picture", type=Path)
     parser.add_argument(
@@ -243,18 +287,22 @@ def main() -> None:
         "start_error_median_s": float(np.median(np.abs([row["start_error_s"] for row in rows]))),
     }
     judged = None if options.data is None else judge_simulated(options.data)
+    stills = [measure_still(options.films / "stills", 100 + k) for k in range(options.stills)]
+    summary["stills"] = summarise_stills(stills) if stills else None
     print(json.dumps({"summary": summary, "judging": judged}, indent=1))
     if options.out is not None:
         content = {
             "versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__},
             "run": str(options.run),
         }
-        options.out.write_text(
-            json.dumps(
-                content | {"summary": summary, "judging": judged, "films": rows, "refused": refused}, indent=1
-            )
-            + "\n"
-        )
+        content |= {
+            "summary": summary,
+            "judging": judged,
+            "films": rows,
+            "stills": stills,
+            "refused": refused,
+        }
+        options.out.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

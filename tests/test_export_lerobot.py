@@ -21,6 +21,7 @@ from foretrace.export.lerobot import export_lerobot
 from foretrace.export.statistics import all_statistics, picture_statistics, vector_statistics
 from foretrace.geometry import pose_to_matrix
 from foretrace.interactions.dataset import Dataset
+from foretrace.predictor import TrainConfig, train_predictor
 
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
 
@@ -193,6 +194,35 @@ def test_rerun_reads_it(folder):
         rows[chunk.entity_path] = max(rows.get(chunk.entity_path, 0), chunk.num_rows)
     for name in ("observation.state", "action", "observation.images.view"):
         assert rows[f"/{name}"] == NUM_SAMPLES, rows
+
+
+def test_episodes_are_split_as_the_training_was(tmp_path):
+    data, run, other = fake_data(tmp_path / "data", 9), tmp_path / "run", fake_data(tmp_path / "other", 8)
+    config = TrainConfig(features="none", epochs=1, min_steps=1, split=(3, 2, 1), threads=1)
+    train_predictor(Dataset.open(data), config, run)
+    parts = json.loads((run / "split.json").read_text())
+
+    def exported(source, name, *options) -> tuple[dict, list[int]]:
+        out = tmp_path / name
+        command = ["export", "lerobot", "--data", str(source), "--out", str(out), *options]
+        assert cli.main(command) == 0
+        rows = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet")
+        return json.loads((out / "meta/info.json").read_text())["splits"], rows[
+            "foretrace/interaction"
+        ].to_pylist()
+
+    splits, ids = exported(data, "split", "--run", str(run))
+    assert splits == {"train": "0:3", "validation": "3:5", "test": "5:6", "rest": "6:9"}
+    assert [sorted(ids[a:b]) for a, b in ((0, 3), (3, 5), (5, 6))] == [
+        sorted(parts[name]) for name in ("train", "validation", "test")
+    ]
+    assert sorted(ids) == list(range(9))
+    few = [parts["test"][0], parts["train"][0]]
+    splits, ids = exported(data, "few", "--run", str(run), "--ids", *map(str, few))
+    assert (splits, ids) == ({"train": "0:1", "test": "1:2"}, few[::-1])
+    # What was trained on other data says nothing about these.
+    assert exported(other, "other-out", "--run", str(run)) == ({"train": "0:8"}, list(range(8)))
+    assert exported(data, "plain") == ({"train": "0:9"}, list(range(9)))
 
 
 def test_recordings_of_other_sampling_are_refused_or_resampled(tmp_path):

@@ -1,11 +1,14 @@
 """From a data set through a camera to a data set: films of `foretrace film`, imported, learned from and judged by."""
 
+import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from foretrace.cli import main
+from foretrace.evaluation.transfer_recorded import levered_edge
 from foretrace.interactions.dataset import Dataset
 from foretrace.perception.films import open_film
 from foretrace.predictor import TrainConfig, load_predictor, train_predictor
@@ -70,6 +73,7 @@ def test_recordings_are_learned_from_and_judged_like_simulations(
     assert main(["overlay", str(recorded), "0", "--run", str(tmp_path / "run"), "--out", str(video)]) == 0
     shown, film = list(open_film(video).frames()), list(open_film(recorded.parent / "film-0").frames())
     assert len(shown) == len(film)
+    assert (tmp_path / "overlay-side.png").stat().st_size > 1000
     changed = np.abs(shown[-1].picture.astype(int) - film[-1].picture).max(axis=2) > 80
     assert 100 < changed.sum() < 0.1 * changed.size
     assert main(["overlay", str(recorded), "9", "--run", str(tmp_path / "run"), "--out", str(video)]) == 2
@@ -83,3 +87,29 @@ def test_a_film_of_nothing(simulated: Path, tmp_path: Path, capsys: pytest.Captu
     assert "has no interaction 99999 with a motion" in capsys.readouterr().err
     assert main(["film", str(simulated), "0", "--out", str(simulated)]) == 2
     assert "is in use: choose another folder" in capsys.readouterr().err
+
+
+def test_recordings_get_the_tables_of_the_paper(
+    recorded: Path, simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["evaluate", "transfer", "--recorded", str(recorded), "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    assert "| Recorded vs simulation, mean |" in capsys.readouterr().out
+    rows = pd.read_csv(tmp_path / "out" / "transfer.csv")
+    assert rows["interaction"].tolist() == [0, 1, 2]
+    assert rows["repetition"].tolist() == [0, 1, 0]
+    edges = [levered_edge(each) + 1 for each in Dataset.open(recorded)]
+    assert rows["contact"].tolist() == edges
+    # The film shows what the simulator does, but for how well it was seen; the prediction is another matter.
+    assert rows["distance_simulated_cm"].between(1e-3, 0.2).all()
+    assert (rows["distance_predicted_cm"] > rows["distance_simulated_cm"]).all()
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["predictor"] == "default"
+    assert [sum(entry["outcomes"].values()) for entry in summary["edges"]] == [2, 1]
+    assert {entry["group"] for entry in summary["edges"]} == {"recorded"}
+    assert (tmp_path / "out" / "figure-14.png").stat().st_size > 1000
+    assert main([*command, "--repeats", "3"]) == 2
+    assert "--repeats is about the stand-in" in capsys.readouterr().err
+    command[3] = str(simulated)
+    assert main(command) == 2
+    assert "is simulated: give a data set that" in capsys.readouterr().err

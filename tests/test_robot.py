@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import mujoco
@@ -17,7 +18,7 @@ from foretrace.robot.checks import ArmLimits, check_path, check_start, refuse_un
 from foretrace.robot.controller import ArmState, UrController
 from foretrace.robot.execution import WatchConfig, refuse_unready
 from foretrace.robot.kinematics import ArmKinematics
-from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, read_base_pose
+from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, plan_retreat, read_base_pose
 from foretrace.simulation import arm
 from foretrace.simulation.engine import tip_transforms
 from foretrace.simulation.scene import build_scene
@@ -77,6 +78,27 @@ def test_legs_join_and_rest_at_their_ends(legs):
     for leg in [plan_approach(GOOD, legs[0].joints[0]), *legs]:
         speeds = np.diff(leg.joints, axis=0) / arm.CONTROL_PERIOD
         assert np.abs(speeds[[0, -1]]).max() < 0.01
+
+
+def test_the_retreat_sets_down_pulls_out_and_goes_up(kinematics, legs):
+    set_down, retreat = plan_retreat(legs)
+    assert (set_down.name, retreat.name) == ("set-down", "retreat")
+    for before, leg in pairwise([legs[1], set_down, retreat]):
+        np.testing.assert_array_equal(before.joints[-1], leg.joints[0])
+    T_action_base = ACTION.T_action_object @ T_TABLE_BASE
+    tips = [
+        np.array([T_action_base @ posture.T_base_tip for posture in kinematics.along(leg.joints)])[:, :3, 3]
+        for leg in (set_down, retreat)
+    ]
+    path = ToolPath()
+    lowered = np.flatnonzero(tips[0][:, 2] > tips[0][-1, 2] + 1e-4)[-1]
+    # Lowered before it is pulled out; the pull is level, and ends before the contact.
+    assert tips[0][lowered, 0] == pytest.approx(path.insertion, abs=1e-3)
+    assert np.ptp(tips[0][lowered + 1 :, 2]) < 2e-4
+    assert tips[0][-1, 0] == pytest.approx(-path.standoff, abs=1e-4)
+    np.testing.assert_allclose(tips[1][-1] - tips[1][0], [-0.05, 0, 0.10], atol=1e-4)
+    for leg in (set_down, retreat):
+        refuse_unsafe(check_path(leg, kinematics.along(leg.joints), T_TABLE_BASE, ArmLimits()))
 
 
 def test_speed_scales_time_alone(kinematics, legs):
@@ -229,8 +251,17 @@ def test_a_dry_run_opens_no_connection(base_file, tmp_path, capsys, monkeypatch)
     assert "REFUSED" not in printed
     rows = (tmp_path / "path.csv").read_text().splitlines()
     assert rows[0].startswith("time_s,leg,shoulder_pan_rad")
-    assert len(rows) == 1 + 251 + 370
-    assert all(check["passed"] for check in json.loads((tmp_path / "checks.json").read_text()))
+    assert [row.split(",")[1] for row in rows[1:]] == [
+        *["descent"] * 251,
+        *["lever-up"] * 370,
+        *["set-down"] * 370,
+        *["retreat"] * 251,
+    ]
+    checks = json.loads((tmp_path / "checks.json").read_text())
+    assert all(check["passed"] for check in checks)
+    assert {check["leg"] for check in checks} == {"descent", "lever-up", "set-down", "retreat"}
+    assert cli.main(command(base_file, tmp_path, "--speed", "1", "--no-retreat")) == 0
+    assert len((tmp_path / "path.csv").read_text().splitlines()) == 1 + 251 + 370
 
 
 def test_a_refused_path_opens_no_connection(base_file, tmp_path, capsys):
@@ -262,7 +293,7 @@ def test_nothing_moves_before_somebody_says_yes(base_file, tmp_path, capsys, mon
 
     def fake_execute(host, legs, kinematics, T_table_base, out, limits, watch, confirm, film):
         assert (host, out, film, watch.timeout) == ("arm", tmp_path / "recording.csv", None, 0.3)
-        assert [leg.name for leg in legs] == ["descent", "lever-up"]
+        assert [leg.name for leg in legs] == ["descent", "lever-up", "set-down", "retreat"]
         given.extend(confirm([]) for _ in range(3))
         confirm([])
 

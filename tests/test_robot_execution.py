@@ -29,6 +29,7 @@ NUM = 100
 LEG = ArmPath("lever-up", START + np.linspace(0, 0.2, NUM)[:, None] * np.array([1, 0, 0, -1, 0, 0]))
 PATIENT, WATCH = WatchConfig(timeout=1.5), WatchConfig(timeout=0.5)
 """Longer than the default: the tests' machine may be busy."""
+BACK = ArmPath("set-down", LEG.joints[::-1])
 HALF = 30
 
 
@@ -49,8 +50,9 @@ def go(
     confirm=lambda checks: True,
     film=None,
     watch=PATIENT,
+    legs=(LEG,),
 ) -> None:
-    execute(host, [LEG], kinematics, np.eye(4), recording, ArmLimits(), watch, confirm, film)
+    execute(host, legs, kinematics, np.eye(4), recording, ArmLimits(), watch, confirm, film)
 
 
 def read(recording: Path) -> list[dict[str, str]]:
@@ -78,6 +80,17 @@ def test_a_lever_up_is_executed(kinematics, recording):
     last = [float(rows[-1][name]) for name in rows[-1] if name.endswith(("pan_rad", "wrist_1_rad"))]
     np.testing.assert_allclose(last, LEG.joints[-1, [0, 3]], atol=1e-3)
     assert {(row["robot_mode"], row["safety_mode"]) for row in rows} == {("7", "1")}
+
+
+def test_the_way_back_follows_and_is_recorded(kinematics, recording):
+    with RunningController(START) as controller:
+        go(controller.host, kinematics, recording, legs=(LEG, BACK))
+    hold = round(SETTLE / CONTROL_PERIOD)
+    np.testing.assert_allclose(controller.facts.set_points[-NUM - hold : -hold], BACK.joints, atol=1e-12)
+    np.testing.assert_allclose(controller.facts.joints, START, atol=1e-4)
+    legs = [row["leg"] for row in read(recording)]
+    assert list(dict.fromkeys(legs)) == ["approach", "lever-up", "set-down", "hold"]
+    assert legs.count("set-down") == NUM
 
 
 class PacedCamera:
@@ -109,7 +122,7 @@ def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording,
     film = Filming(str(video), folder)
     monkeypatch.setattr(film, "_capture", PacedCamera(video))
     with RunningController(START) as controller:
-        go(controller.host, kinematics, recording, film=film)
+        go(controller.host, kinematics, recording, film=film, legs=(LEG, BACK))
     with (folder / "timestamps.csv").open(newline="") as file:
         frames = list(csv.DictReader(file))
     times, rows = [float(frame["time_s"]) for frame in frames], read(recording)
@@ -149,11 +162,13 @@ def test_a_camera_that_is_not_there_is_named(tmp_path):
 )
 def test_what_goes_wrong_half_way_stops_the_arm(kinematics, recording, event, said, stops):
     with RunningController(START, HALF, event) as controller, pytest.raises(RobotError, match=said):
-        go(controller.host, kinematics, recording, watch=WATCH)
+        go(controller.host, kinematics, recording, watch=WATCH, legs=(LEG, BACK))
     assert controller.facts.stops == stops
     assert controller.facts.uploads == 1
     assert HALF <= len(controller.facts.set_points) < HALF + 75
-    assert len(read(recording)) >= HALF
+    rows = read(recording)
+    assert len(rows) >= HALF
+    assert rows[-1]["leg"] == "lever-up"  # no way back after a stop
 
 
 def test_ctrl_c_stops_the_arm_and_keeps_the_recording(kinematics, recording):

@@ -73,14 +73,16 @@ def export_lerobot(
         data: Folder of the data set.
         out: Folder to make.
         ids: Numbers of the interactions; by default all that have a motion.
-        run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
+        run: Folder of a training, whose predictor's imagined motion is written beside the observed one. If it was
+            trained on this data set, episodes are ordered and split by its parts.
         fps: Frames per second, to which all are resampled; by default the rate at which they were sampled.
         camera: Render the pictures of a camera beside the table; for simulated interactions only.
     """
-    from foretrace.export.episodes import choose
+    from foretrace.export.episodes import choose_by_part
     from foretrace.export.lerobot import export_lerobot
 
-    export_lerobot(choose(data, ids, run), out, fps, camera)
+    episodes, splits = choose_by_part(data, ids, run)
+    export_lerobot(episodes, out, fps, camera, splits)
     print(out)
 
 

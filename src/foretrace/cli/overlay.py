@@ -18,6 +18,8 @@ def overlay(
 ) -> None:
     """Draw what a predictor expects and what was observed over an imported film, frame by frame, as an MP4.
 
+    Beside it a picture is written that shows both paths from the side, its name with "-side.png" in place of ".mp4".
+
     Red: predicted, before the touch. Green: observed so far. White: the object's outline. A translucent tube: how
     uncertain the prediction is, where the predictor says so. Needs foretrace[video], and the film where it was when it
     was imported.
@@ -34,6 +36,7 @@ def overlay(
     import numpy as np
 
     from foretrace.errors import DatasetError, PerceptionError
+    from foretrace.evaluation.transfer_figures import side_figure
     from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.recorded import NOTES_FOLDER
     from foretrace.perception.films import open_film
@@ -55,6 +58,13 @@ def overlay(
     pictures = _drawn(film.frames(), said, dataset[row], imagined)
     count = write_video(out, pictures, float(1 / np.median(np.diff(times))))
     print(f"{count} frames: {out}")
+    effect, side = dataset[row].effect, out.with_name(f"{out.stem}-side.png")
+    end = None if effect.slip_index is None else effect.times[effect.slip_index]
+    until = slice(end if end is None else int(np.searchsorted(imagined.times, end)))
+    paths = effect.com_trajectory[: effect.slip_index], imagined.com_trajectory[until]
+    slips = "" if end is None else f", slips at {end:.1f} s"
+    side_figure(*paths, f"Recording {id}: {effect.outcome}{slips}".replace("slipped, ", "")).savefig(side)
+    print(side)
 
 
 def _drawn(

@@ -210,12 +210,14 @@ def look_at_photo(
     taken_by.check_picture(picture, str(photo))
     seen = align_patterns(picture, detect_markers(picture, layout.dictionary), layout.dictionary)
     T_table_camera = invert_transform(still_pose([seen], layout.table, taken_by))
+    cover = None
     if mask == "background":
         if background is None:
             raise PerceptionError(
                 "--mask background needs --background, a picture of the table without the object"
             )
-        found = masks.mask_by_background(picture, read_picture(background))
+        cover = masks.cover_by_background(picture, read_picture(background))
+        found = cover > 0.5
     elif mask == "grabcut":
         if box is None:
             raise PerceptionError("--mask grabcut needs --box LEFT TOP WIDTH HEIGHT round the object")
@@ -225,6 +227,7 @@ def look_at_photo(
     else:
         found = masks.mask_by_threshold(picture)
     whole = masks.pick_object(found, contact_px)
+    whole = whole if cover is None else masks.cover_of(cover, whole)
     height = DEFAULT_HEIGHT if height is None else height
     placed = place_object(whole, taken_by, T_table_camera, height, min(BEVEL.height, 0.5 * height), hull)
     sight = see(placed, contact_at_pixel(placed, contact_px, taken_by, T_table_camera))

@@ -20,6 +20,7 @@ def robot(
     out: Path = Path("execution"),
     speed: float = 0.1,
     clearance: float = 0.0004,
+    retreat: bool = True,
     execute: bool = False,
     host: str | None = None,
     yes: bool = False,
@@ -41,6 +42,8 @@ def robot(
         out: Folder for path.csv, checks.json, recording.csv and film.
         speed: Share of the tool path's own speed, at most 1.
         clearance: Gap between the blade's tip and the table [m].
+        retreat: Afterwards set the object down the way it was lifted, pull the blade out, and go up by 10 cm.
+            Otherwise the arm stays at the path's end, with the object on the blade.
         execute: Move the arm.
         host: Name or address of the controller; needed with --execute.
         yes: Do not ask before the arm moves.
@@ -54,7 +57,7 @@ def robot(
     from foretrace.robot.execution import execute as move
     from foretrace.robot.filming import Filming
     from foretrace.robot.kinematics import ArmKinematics
-    from foretrace.robot.path import plan_lever_up, read_base_pose
+    from foretrace.robot.path import plan_lever_up, plan_retreat, read_base_pose
     from foretrace.simulation.tool import Tool
 
     if execute and host is None:
@@ -63,6 +66,7 @@ def robot(
     T_table_base = read_base_pose(base)
     action, tool_path = LeverUp(contact, direction), ToolPath(clearance=clearance)
     legs = plan_lever_up(kinematics, action, T_table_base, tool_path, speed)
+    legs += plan_retreat(legs) if retreat else []
     postures = [kinematics.along(leg.joints) for leg in legs]
     checks = [
         check

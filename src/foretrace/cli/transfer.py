@@ -1,17 +1,23 @@
-"""The command that compares predictions with a stand-in for the real robot."""
+"""The command that compares predictions with recorded lever-ups, or with a stand-in for the real robot."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from foretrace.evaluation.transfer import Transfer
+    from foretrace.predictor.base import EffectPredictor
 
 
 def evaluate_transfer(
-    run: Positional[Path],
+    run: Positional[Path | None] = None,
+    *,
     out: Path,
+    recorded: Path | None = None,
     repeats: int = 10,
     seed: int = 0,
     workers: int = 1,
@@ -21,14 +27,18 @@ def evaluate_transfer(
     prisms: Path | None = None,
     height: float = 0.02,
 ) -> None:
-    """Compare predictions with a stand-in for the real robot: the paper's tables 1 and 2, and figure 15.
+    """Compare predictions with reality, or with a stand-in for it: the paper's tables 1 and 2, and figure 15.
 
-    There is no robot: the stand-in is the other physics engine, Bullet, with other friction, density and thickness,
-    errors of contact, direction, camera and marker, and another sampling rate, all drawn anew every time.
+    Reality is what `foretrace import` recorded. Without it the stand-in is the other physics engine, Bullet, with other
+    friction, density and thickness, errors of contact, direction, camera and marker, and another sampling rate, all
+    drawn anew every time.
 
     Args:
-        run: Folder of the training.
-        out: Folder to write to: transfer.csv, transfer.md, summary.json, figure-14.png, figure-15.png.
+        run: Folder of the training; by default the predictor that comes with foretrace.
+        out: Folder to write to: transfer.csv, transfer.md, summary.json, figure-14.png; without --recorded also
+            figure-15.png.
+        recorded: Folder of a recorded data set, which takes the place of the stand-in: all options that follow are
+            about that one.
         repeats: Lever-ups by the stand-in at every contact.
         seed: Seed of all that is drawn.
         workers: Processes that simulate.
@@ -45,10 +55,18 @@ def evaluate_transfer(
 
     if out.exists() and not out.is_dir():
         raise ResultsError(f"{out} is a file: give a folder to write to")
+    predictor = load_predictor(run)
+    if recorded is not None:
+        of_stand_in = {"repeats": repeats != 10, "seed": seed != 0, "workers": workers != 1}
+        of_stand_in |= {"silhouettes": silhouettes, "size": size != 0.18, "scale": scale}
+        of_stand_in |= {"prisms": prisms, "height": height != 0.02}
+        if idle := [f"--{name}" for name, value in of_stand_in.items() if value]:
+            raise ResultsError(f"{', '.join(idle)} is about the stand-in: leave it out with --recorded")
+        _evaluate_recorded(predictor, recorded, out, _settings(run, predictor, "mujoco"))
+        return
     for name, value in (("size", size), ("scale", scale), ("height", height)):
         if value is not None and not value > 0:
             raise ShapeError(f"--{name} is {value}: give a positive length in metres")
-    predictor = load_predictor(run)
     stand_in = StandIn()
     subjects = transfer_objects.printed_shapes() + transfer_objects.everyday_objects()
     if silhouettes is not None:
@@ -59,37 +77,67 @@ def evaluate_transfer(
         predictor, subjects, stand_in, repeats=repeats, seed=seed, workers=workers
     )
     summary = transfer_report.summarise(found.rows)
-    settings = _settings(run, predictor.features.label, stand_in, repeats, seed)
-    for file in _write(out, found, {**settings, **summary}, transfer_report.markdown(summary, repeats)):
-        print(file)
+    played = {"repeats": repeats, "seed": seed, "stand_in": asdict(stand_in)}
+    note = {"note": transfer_report.NOTE, **_settings(run, predictor, "mujoco", "pybullet")}
+    tables = transfer_report.markdown(summary, repeats)
+    _write(out, found, {**note, **played, **summary}, tables, _stand_in_figures(found))
 
 
-def _settings(run: Path, features: str, stand_in: Any, repeats: int, seed: int) -> dict[str, Any]:
+def _evaluate_recorded(
+    predictor: "EffectPredictor", recorded: Path, out: Path, settings: dict[str, Any]
+) -> None:
+    """Tables and picture of a recorded data set."""
+    from foretrace.evaluation import transfer_report
+    from foretrace.evaluation.transfer_figures import paths_figure
+    from foretrace.evaluation.transfer_recorded import evaluate_recorded
+    from foretrace.interactions.dataset import Dataset
+
+    found = evaluate_recorded(predictor, Dataset.open(recorded))
+    summary = transfer_report.summarise(found.rows)
+    note = {"note": transfer_report.RECORDED_NOTE, **settings, "recorded": str(recorded)}
+    tables = transfer_report.recorded_markdown(summary, found.rows)
+    figure = paths_figure(found.examples, "recorded", "The first recording at each edge; the table is grey")
+    _write(out, found, {**note, **summary}, tables, {"figure-14.png": figure})
+
+
+def _settings(run: Path | None, predictor: "EffectPredictor", *engines: str) -> dict[str, Any]:
     """What decides the numbers."""
-    from dataclasses import asdict
     from importlib.metadata import version
 
     import foretrace
-    from foretrace.evaluation.transfer_report import NOTE
 
-    versions = {name: version(name) for name in ("mujoco", "pybullet", "torch", "numpy")}
+    versions = {name: version(name) for name in (*engines, "torch", "numpy")}
     return {
-        "note": NOTE,
-        "predictor": str(run),
-        "features": features,
-        "repeats": repeats,
-        "seed": seed,
-        "stand_in": asdict(stand_in),
+        "predictor": "default" if run is None else str(run),
+        "features": predictor.features.label,
         "versions": {"foretrace": foretrace.__version__, **versions},
     }
 
 
-def _write(out: Path, found: "Transfer", summary: dict[str, Any], tables: str) -> list[Path]:
-    """Table, summary and pictures; the tables are printed, too."""
-    import json
-
+def _stand_in_figures(found: "Transfer") -> dict[str, "Figure"]:
+    """Paths at some printed edges, and masks and errors of each group of other objects, by file name."""
     from foretrace.evaluation.transfer_figures import objects_figure, paths_figure
     from foretrace.evaluation.transfer_report import PAPER_OBJECTS
+
+    shown = {("pentagon", 1), ("pentagon", 3), ("heptagon", 2), ("heptagon", 6)}
+    printed = [
+        each for each in found.examples if each.group == "printed" and (each.name, each.contact) in shown
+    ]
+    figures = {"figure-14.png": paths_figure(printed)}
+    groups = {"everyday": "figure-15.png", "silhouettes": "silhouettes.png", "prisms": "prisms.png"}
+    for group, name in groups.items():
+        examples = [each for each in found.examples if each.group == group]
+        if examples:
+            paper = PAPER_OBJECTS if group == "everyday" else None
+            figures[name] = objects_figure(examples, found.rows.loc[found.rows["group"].eq(group)], paper)
+    return figures
+
+
+def _write(
+    out: Path, found: "Transfer", summary: dict[str, Any], tables: str, figures: dict[str, "Figure"]
+) -> None:
+    """Table, summary and pictures; the tables are printed, too."""
+    import json
 
     out.mkdir(parents=True, exist_ok=True)
     files = [out / name for name in ("transfer.csv", "transfer.md", "summary.json")]
@@ -97,19 +145,7 @@ def _write(out: Path, found: "Transfer", summary: dict[str, Any], tables: str) -
     files[1].write_text(tables, encoding="utf-8")
     files[2].write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     print(tables)
-    shown = {("pentagon", 0), ("pentagon", 2), ("heptagon", 1), ("heptagon", 5)}
-    printed = [
-        each
-        for each in found.examples
-        if each.subject.group == "printed" and (each.subject.name, each.contact) in shown
-    ]
-    figures = {"figure-14.png": paths_figure(printed)}
-    groups = {"everyday": "figure-15.png", "silhouettes": "silhouettes.png", "prisms": "prisms.png"}
-    for group, name in groups.items():
-        examples = [each for each in found.examples if each.subject.group == group]
-        if examples:
-            paper = PAPER_OBJECTS if group == "everyday" else None
-            figures[name] = objects_figure(examples, found.rows.loc[found.rows["group"].eq(group)], paper)
     for name, figure in figures.items():
         figure.savefig(out / name)
-    return [*files, *(out / name for name in figures)]
+    for file in [*files, *(out / name for name in figures)]:
+        print(file)

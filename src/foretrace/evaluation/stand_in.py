@@ -218,8 +218,8 @@ class Observation:
     """When the object left the blade [s], or None."""
     outcome: Outcome
     """What became of the object."""
-    perturbation: Perturbation
-    """What was different."""
+    perturbation: Perturbation | None
+    """What was different; None: nobody knows."""
     physics: Physics = field(default_factory=Physics)
     """Friction and density as they really were."""
 

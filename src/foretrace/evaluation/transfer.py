@@ -33,16 +33,18 @@ CM = 100.0
 class Example(NamedTuple):
     """The first repetition at one contact, for pictures."""
 
-    subject: Subject
-    """The object."""
+    name: str
+    """Name of the object."""
+    group: str
+    """Where it comes from."""
     contact: int
-    """Number of the contact, from 0."""
+    """Number of the contact, from 1."""
     view: TopDownView
     """What the predictor saw."""
     simulated: Interaction
     """What the simulator made of it."""
     observed: Observation
-    """What the stand-in showed."""
+    """What the stand-in showed, or the camera."""
     imagined: Float[np.ndarray, "time 3"]
     """The imagined path, up to where the observed one ends [m]."""
 
@@ -52,7 +54,7 @@ class Transfer:
     """All comparisons of one predictor."""
 
     rows: pd.DataFrame
-    """One row per lever-up of the stand-in; distances in cm, what was drawn in SI units."""
+    """One row per observed lever-up; distances in cm, what was drawn in SI units."""
     examples: list[Example]
     """One for each contact."""
 
@@ -84,11 +86,7 @@ def evaluate_transfer(
         ShapeError: Two objects have the same name, or one does not fit in the view.
     """
     stand_in = StandIn() if stand_in is None else stand_in
-    if predictor.features.oracle:
-        raise PredictionError(
-            f"features {predictor.features.label!r} are observed during the action and cannot be had from a view: "
-            "use a predictor with other features, such as im-cnn"
-        )
+    check_sees(predictor)
     for name, value, least in (("repeats", repeats, 1), ("workers", workers, 1), ("seed", seed, 0)):
         if value < least:
             raise SimulationError(f"{name} is {value}, it must be at least {least}")
@@ -101,17 +99,49 @@ def evaluate_transfer(
     examples: list[Example] = []
     all_played = _play_all(contacts, stand_in, repeats, seed, workers)
     for (subject, contact), played in _reported(contacts, all_played, console or Console(stderr=True)):
-        exact = played.simulated.view
-        own = own_error(predictor, hull_of(exact) if subject.hull else exact, played.simulated)
-        for repetition, observed in enumerate(played.observed):
-            view = hull_of(observed.view) if subject.hull else observed.view
-            row, imagined = compare(predictor, view, observed, played.simulated)
-            place = {"object": subject.name, "group": subject.group, "contact": contact + 1}
-            row["distance_simulated_predicted_cm"] = own
-            rows.append({**place, "repetition": repetition, **row, **asdict(observed.perturbation)})
-            if repetition == 0:
-                examples.append(Example(subject, contact, view, played.simulated, observed, imagined))
+        found = compare_played(predictor, subject.name, subject.group, contact + 1, played, subject.hull)
+        rows += found[0]
+        examples.append(found[1])
     return Transfer(pd.DataFrame(rows), examples)
+
+
+def check_sees(predictor: EffectPredictor) -> None:
+    """Refuse a predictor that cannot do with a view.
+
+    Raises:
+        PredictionError: Its features cannot be had from one.
+    """
+    if predictor.features.oracle:
+        raise PredictionError(
+            f"features {predictor.features.label!r} are observed during the action and cannot be had from a view: "
+            "use a predictor with other features, such as im-cnn"
+        )
+
+
+def compare_played(
+    predictor: EffectPredictor, name: str, group: str, contact: int, played: Played, hull: bool = False
+) -> tuple[list[dict[str, Any]], Example]:
+    """Distances of all that was observed at one contact, as rows; and the first of it.
+
+    Args:
+        predictor: The predictor.
+        name: Name of the object.
+        group: Where it comes from.
+        contact: Number of the contact, from 1.
+        played: What was simulated and observed there.
+        hull: Whether the predictor sees the convex hull of the object's mask.
+    """
+    exact = played.simulated.view
+    own = own_error(predictor, hull_of(exact) if hull else exact, played.simulated)
+    rows, examples = [], []
+    for repetition, observed in enumerate(played.observed):
+        view = hull_of(observed.view) if hull else observed.view
+        row, imagined = compare(predictor, view, observed, played.simulated)
+        place = {"object": name, "group": group, "contact": contact, "repetition": repetition}
+        drawn = {} if observed.perturbation is None else asdict(observed.perturbation)
+        rows.append({**place, **row, "distance_simulated_predicted_cm": own, **drawn})
+        examples.append(Example(name, group, contact, view, played.simulated, observed, imagined))
+    return rows, examples[0]
 
 
 def compare(

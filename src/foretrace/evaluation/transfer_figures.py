@@ -1,4 +1,4 @@
-"""Pictures of the comparisons with the stand-in: the paper's figure 15, and the last panel of its figure 14."""
+"""Pictures of the comparisons with stand-in or recordings: the paper's figure 15, and figure 14's last panel."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -29,7 +30,7 @@ from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
 BARS = {"predicted": ("distance_predicted_cm", VERMILLION), "simulated": ("distance_simulated_cm", BLUE)}
 PATHS: dict[str, tuple[str, Any, float]] = {
-    "stand-in": (GREEN, "-", 2.4),
+    "observed": (GREEN, "-", 2.4),
     "predicted": (VERMILLION, "--", 1.8),
     "simulated": (BLUE, "-.", 1.8),
 }
@@ -41,6 +42,8 @@ PANEL = 10.0
 """Width of what is shown around paths [cm]."""
 PER_ROW = 7
 """Masks side by side."""
+PATHS_PER_ROW = 4
+"""Panels with paths side by side."""
 
 
 def objects_figure(
@@ -53,7 +56,7 @@ def objects_figure(
         rows: Their lever-ups.
         paper: The paper's errors by object [cm].
     """
-    names = list(dict.fromkeys(example.subject.name for example in examples))
+    names = list(dict.fromkeys(example.name for example in examples))
     columns = min(len(names), PER_ROW)
     lines = -(-len(names) // columns)
     with mpl.rc_context(STYLE):
@@ -64,7 +67,7 @@ def objects_figure(
         above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
         cells = above.subplots(lines, columns, squeeze=False).ravel()
         for ax, name in zip(cells, names, strict=False):
-            draw_view(ax, [example for example in examples if example.subject.name == name])
+            draw_view(ax, [example for example in examples if example.name == name])
         for ax in cells[len(names) :]:
             ax.axis("off")
         draw_errors(below.subplots(), rows, names, paper or {})
@@ -104,11 +107,11 @@ def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
     left, right = (CONTACT_PIXEL[1] - edge) * METRES_PER_PIXEL * CM
     colors = ListedColormap(["white", HULL_COLOR, MASK_COLOR])
     ax.imshow(shown, cmap=colors, vmin=0, vmax=2, extent=(left, right, bottom, top), interpolation="nearest")
-    T = first.subject.actions[first.contact].T_action_object
-    outline = first.subject.obj.corners @ T[:2, :2].T + T[:2, 3]
+    T = first.simulated.action.T_action_object
+    outline = first.simulated.object.corners @ T[:2, :2].T + T[:2, 3]
     closed = np.concatenate([outline, outline[:1]]) * CM
     ax.plot(closed[:, 1], closed[:, 0], color=OBJECT_EDGE, linewidth=1)
-    contacts = np.array([example.subject.actions[example.contact].contact for example in examples[1:]])
+    contacts = np.array([example.simulated.action.contact for example in examples[1:]])
     if len(contacts):
         others = (contacts @ T[:2, :2].T + T[:2, 3]) * CM
         ax.plot(others[:, 1], others[:, 0], "o", color=INK, markersize=4)
@@ -119,7 +122,7 @@ def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
     ax.set(
         xlim=(middle[1] + half, middle[1] - half), ylim=(middle[0] - half, middle[0] + half), aspect="equal"
     )
-    ax.set_title(first.subject.name, loc="center")
+    ax.set_title(first.name, loc="center")
     ax.set(xticks=[], yticks=[])
     ax.spines[["left", "bottom"]].set_visible(False)
     ax.plot(
@@ -163,51 +166,88 @@ def draw_errors(ax: Axes, rows: pd.DataFrame, names: Sequence[str], paper: Mappi
             label.set_verticalalignment("top")
 
 
-def paths_figure(examples: Sequence[Example]) -> Figure:
-    """Paths of the centre of mass from the side: stand-in, predicted, simulated (paper, figure 14, last panel).
+def paths_figure(
+    examples: Sequence[Example],
+    observed: str = "stand-in",
+    note: str = "The stand-in is Bullet with other constants and errors, not a robot; the table is grey",
+) -> Figure:
+    """Paths of the centre of mass from the side: observed, predicted, simulated (paper, figure 14, last panel).
 
     Args:
-        examples: At most four of them look well.
+        examples: What is shown, four in a row.
+        observed: What the observed path is called.
+        note: What stands under the title.
     """
+    columns = min(len(examples), PATHS_PER_ROW)
+    lines = -(-len(examples) // columns)
     with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(3.4 * len(examples), 4.9), dpi=DPI, layout="constrained")
-        for ax, example in zip(fig.subplots(1, len(examples), squeeze=False)[0], examples, strict=True):
-            effect, observed = example.simulated.effect, example.observed
-            end = effect.slip_index
-            if observed.slip_time is not None:
-                slip = int(np.searchsorted(effect.times, observed.slip_time))
-                end = slip if end is None else min(end, slip)
-            paths = {
-                "stand-in": observed.com,
-                "predicted": example.imagined,
-                "simulated": effect.com_trajectory[:end],
-            }
-            for name, path in paths.items():
-                color, style, width = PATHS[name]
-                ax.plot(
-                    path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=5
-                )
-                ax.plot(path[-1:, 0] * CM, path[-1:, 2] * CM, "o", color=color, markersize=4.5, zorder=6)
-            slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
-            ax.set_title(f"{example.subject.name}, contact {example.contact + 1}{slipped}")
-            seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
-            (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
-            middle = (left + right) / 2
-            ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
-            ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
-            ax.axhspan(-1, 0, color="#f1f2f4", zorder=-1)
-            ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
-            ax.grid(color=GRID, linewidth=0.6)
-            ax.set_axisbelow(True)
+        width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
+        fig = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+        cells = fig.subplots(lines, columns, squeeze=False).ravel()
+        for ax, example in zip(cells, examples, strict=False):
+            draw_example(ax, example)
+        for ax in cells[len(examples) :]:
+            ax.axis("off")
         handles = [
             Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
-            for name, (color, style, width) in PATHS.items()
+            for name, (color, style, width) in zip(
+                (observed, "predicted", "simulated"), PATHS.values(), strict=True
+            )
         ]
         fig.legend(handles=handles, loc="outside lower center", ncols=3)
-        title = "Paths of the centre of mass from the side"
-        finish(
-            fig,
-            title,
-            "The stand-in is Bullet with other constants and errors, not a robot; the table is grey",
-        )
+        finish(fig, "Paths of the centre of mass from the side", note)
     return fig
+
+
+def side_figure(
+    observed: Float[np.ndarray, "time 3"], predicted: Float[np.ndarray, "later 3"], title: str
+) -> Figure:
+    """Observed and predicted path of one recording from the side (paper, figure 14, last panel).
+
+    Args:
+        observed: Centre of mass in the action frame [m].
+        predicted: The same as it was imagined.
+        title: What the recording is called.
+    """
+    with mpl.rc_context(STYLE):
+        fig = Figure(figsize=(6.4, 6.4), dpi=DPI, layout="constrained")
+        ax = fig.subplots()
+        draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
+        ax.legend(loc="upper left")
+        finish(fig, "Paths of the centre of mass from the side", "The table is grey")
+    return fig
+
+
+def draw_example(ax: Axes, example: Example) -> None:
+    """One contact's paths from the side, up to the first slip."""
+    effect, observed = example.simulated.effect, example.observed
+    end = effect.slip_index
+    if observed.slip_time is not None:
+        slip = int(np.searchsorted(effect.times, observed.slip_time))
+        end = slip if end is None else min(end, slip)
+    slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
+    paths = {
+        "observed": observed.com,
+        "predicted": example.imagined,
+        "simulated": effect.com_trajectory[:end],
+    }
+    draw_paths(ax, paths, f"{example.name}, contact {example.contact}{slipped}")
+
+
+def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: str) -> None:
+    """Paths [m] by what they are, in the x-z plane of the action frame; scales in cm."""
+    for name, path in paths.items():
+        color, style, width = PATHS[name]
+        x, z = path[:, 0] * CM, path[:, 2] * CM
+        ax.plot(x, z, color=color, linestyle=style, linewidth=width, zorder=5, label=name)
+        ax.plot(x[-1:], z[-1:], "o", color=color, markersize=4.5, zorder=6)
+    ax.set_title(title)
+    seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
+    (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
+    middle = (left + right) / 2
+    ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
+    ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
+    ax.axhspan(-1, 0, color="#f1f2f4", zorder=-1)
+    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
+    ax.grid(color=GRID, linewidth=0.6)
+    ax.set_axisbelow(True)

@@ -1,4 +1,4 @@
-"""What the comparisons with the stand-in come to: a summary, and tables as the paper prints them."""
+"""What the comparisons with stand-in or recordings come to: a summary, and tables as the paper prints them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -37,6 +37,14 @@ NOTE = (
     "cm: mean over the paths after dynamic time warping, up to where the object slips off the blade. The paper gives "
     "one number for each edge or object, of a real robot."
 )
+RECORDED_NOTE = (
+    "Every recorded lever-up against the simulation of the same object, contact and path, and against what the "
+    "predictor imagines from the recorded view. Friction and density of a recording are not known: the simulator has "
+    "the usual ones. Distances in cm: mean over the paths after dynamic time warping, up to where the object slips off "
+    "the blade."
+)
+EDGED = {"printed": "every printed edge", "recorded": "every recorded edge"}
+"""Groups whose contacts are edges, and what a bar calls them."""
 
 
 def summarise(rows: pd.DataFrame) -> dict[str, Any]:
@@ -46,20 +54,23 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
         rows: As in `foretrace.evaluation.transfer.Transfer`.
 
     Returns:
-        ``edges``: one entry for each edge of a printed shape; ``objects``: one for each other object; ``bars``: which
-        means and which single lever-ups lie below the bars; ``outcomes``: how often what happened.
+        ``edges``: one entry for each edge of a printed or recorded shape; ``objects``: one for each other object;
+        ``bars``: which means and which single lever-ups lie below the bars; ``outcomes``: how often what happened.
     """
     edges: list[dict[str, Any]] = []
     objects: list[dict[str, Any]] = []
-    printed = rows.loc[rows["group"].eq("printed")]
-    for name, edge in dict.fromkeys(zip(printed["object"], printed["contact"], strict=True)):
-        part = printed.loc[printed["object"].eq(name) & printed["contact"].eq(edge)]
+    edged = rows.loc[rows["group"].isin(EDGED)].sort_values(["object", "contact"], kind="stable")
+    for group, name, edge in dict.fromkeys(
+        zip(edged["group"], edged["object"], edged["contact"], strict=True)
+    ):
+        part = edged.loc[edged["group"].eq(group) & edged["object"].eq(name) & edged["contact"].eq(edge)]
         paper = {
             "simulated": _listed(PAPER_SIMULATED, name, edge - 1),
             "predicted": _listed(PAPER_PREDICTED, name, edge - 1),
         }
-        edges.append({"object": name, "edge": int(edge), "paper": paper, **_statistics(part)})
-    others = rows.loc[rows["group"].ne("printed")]
+        place = {"object": name, "group": group, "edge": int(edge)}
+        edges.append({**place, "paper": paper, **_statistics(part)})
+    others = rows.loc[~rows["group"].isin(EDGED)]
     for group, name in dict.fromkeys(zip(others["group"], others["object"], strict=True)):
         part = others.loc[others["group"].eq(group) & others["object"].eq(name)]
         paper = {"predicted": PAPER_OBJECTS.get(name) if group == "everyday" else None}
@@ -69,8 +80,11 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
         )
     everyday = [entry for entry in objects if entry["group"] == "everyday"]
     bars = []
-    if edges:
-        bars += [_bar("every printed edge", edges, printed, bar) for bar in (PAPER_BAR, GOAL)]
+    for group, words in EDGED.items():
+        mine = [entry for entry in edges if entry["group"] == group]
+        if mine:
+            part = edged.loc[edged["group"].eq(group)]
+            bars += [_bar(words, mine, part, bar) for bar in (PAPER_BAR, GOAL)]
     if everyday:
         bars.append(_bar("every everyday object", everyday, rows.loc[rows["group"].eq("everyday")], GOAL))
     return {"edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
@@ -112,14 +126,14 @@ def _bar(what: str, entries: Sequence[Mapping[str, Any]], rows: pd.DataFrame, ba
     return result
 
 
-def bar_lines(summary: Mapping[str, Any]) -> list[str]:
-    """One sentence for each bar."""
+def bar_lines(summary: Mapping[str, Any], observed: str = "stand-in") -> list[str]:
+    """One sentence for each bar; what was observed has a name."""
     lines = []
     for bar in summary["bars"]:
         for name in ("predicted", "simulated"):
             found = bar[name]
             lines.append(
-                f"{bar['what']} under {bar['below_cm']:g} cm on average, stand-in against {name}: "
+                f"{bar['what']} under {bar['below_cm']:g} cm on average, {observed} against {name}: "
                 f"{'yes' if found['holds'] else 'no'} ({found['means_below']} of {found['means']}; "
                 f"{100 * found['share_of_lever_ups']:.0f} % of the single lever-ups)"
             )
@@ -153,20 +167,49 @@ def markdown(summary: Mapping[str, Any], repeats: int) -> str:
     return "\n\n".join([*parts, "## Bars", bars]) + "\n"
 
 
-def _table(heads: Sequence[str], entries: Sequence[Mapping[str, Any]], kinds: Iterable[str]) -> str:
-    """Columns as in the paper; rows from the paper and the stand-in."""
-    lines = [["", *heads]]
+def recorded_markdown(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+    """Tables 1 and 2 of recorded lever-ups: one for each object, and one with every interaction.
+
+    Args:
+        summary: As `summarise` makes it.
+        rows: What it was made of.
+    """
+    parts = ["# Predictions against recorded lever-ups", RECORDED_NOTE]
+    for name in dict.fromkeys(entry["object"] for entry in summary["edges"]):
+        entries = [entry for entry in summary["edges"] if entry["object"] == name]
+        heads = [f"Edge {entry['edge']}" for entry in entries]
+        parts += [f"## {name}", _table(heads, entries, ("simulated", "predicted"), "Recorded")]
+    columns = ["interaction", "object", "contact", "outcome", "simulated_outcome"]
+    lines = [["Interaction", "Object", "Edge", "Outcome", "Simulated", "vs simulation", "vs predicted"]]
+    for row in rows.to_dict("records"):
+        distances = (row[DISTANCES[kind]] for kind in ("simulated", "predicted"))
+        numbers = [_number(None if np.isnan(value) else value) for value in distances]
+        lines.append([*(str(row[column]) for column in columns), *numbers])
+    bars = "\n".join(f"- {line}" for line in bar_lines(summary, "recorded"))
+    return "\n\n".join([*parts, "## Interactions", _rows(lines), "## Bars", bars]) + "\n"
+
+
+def _table(
+    heads: Sequence[str],
+    entries: Sequence[Mapping[str, Any]],
+    kinds: Iterable[str],
+    observed: str = "Stand-in",
+) -> str:
+    """Columns as in the paper; rows from the paper and from what was observed here."""
+    lines = [["", *heads], ["Lever-ups", *(str(sum(entry["outcomes"].values())) for entry in entries)]]
+    repeated = any(sum(entry["outcomes"].values()) > 1 for entry in entries)
     for kind in kinds:
         word = {"simulated": "simulation", "predicted": "predicted"}[kind]
         paper = [entry["paper"].get(kind) for entry in entries]
         if any(value is not None for value in paper):
             lines.append([f"Paper: real vs {word}", *map(_number, paper)])
         lines += [
-            [f"Stand-in vs {word}, {words}", *(_number(entry[kind][key]) for entry in entries)]
+            [f"{observed} vs {word}, {words}", *(_number(entry[kind][key]) for entry in entries)]
             for key, words in STATISTICS.items()
+            if repeated or key == "mean"
         ]
     blind = [_number(entry["predicted_from_view"]["mean"]) for entry in entries]
-    lines.append(["Stand-in vs predicted from the view alone, mean", *blind])
+    lines.append([f"{observed} vs predicted from the view alone, mean", *blind])
     own = [_number(entry["simulated_predicted"]["mean"]) for entry in entries]
     lines.append(["Simulation vs predicted, told everything", *own])
     lines.append(["Not levered", *(_others(entry["outcomes"]) for entry in entries)])

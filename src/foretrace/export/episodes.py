@@ -11,9 +11,11 @@ from foretrace.errors import ExportError, PredictionError
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
-from foretrace.predictor import load_predictor
+from foretrace.predictor import load_predictor, parts_of
 from foretrace.predictor.base import EffectPredictor, ImaginedEffect
 
+REST = "rest"
+"""What is in no part of a training's split: of outcomes that it leaves out, or cut off by the parts' sizes."""
 MOST_LISTED = 8
 """So many unknown ids are named; of the rest only the number is."""
 
@@ -59,6 +61,31 @@ class Episodes(Sequence[Episode]):
             return Episode(interaction)
         # As a batch, which brings along whatever else the predictor was trained to know.
         return Episode(interaction, self.predictor.imagine_batch(self.dataset[index : index + 1].batch())[0])
+
+
+def choose_by_part(
+    data: Path, ids: Sequence[int] | None = None, run: Path | None = None
+) -> tuple[Episodes, dict[str, range]]:
+    """Choose what to export, ordered by the parts of the training's split; and where each part is.
+
+    Args:
+        data: Folder of the data set.
+        ids: Numbers of the interactions; None: all that have a motion.
+        run: Folder of a training, whose predictor imagines each of them. What is in none of its parts comes last.
+            Without a run, or one that was trained on other data, all is one part in the given order.
+
+    Raises:
+        ForetraceError: As `choose` does.
+    """
+    chosen = choose(data, ids, run)
+    parts = {} if run is None else parts_of(run, Dataset.open(data))
+    part_of_id = {id: name for name, members in parts.items() for id in members}
+    names = [*parts, REST] if parts else ["train"]
+    mine = [part_of_id.get(int(id), names[-1]) for id in chosen.dataset.table["id"].to_numpy()]
+    order = sorted(range(len(mine)), key=lambda row: names.index(mine[row]))
+    ends = np.cumsum([mine.count(name) for name in names]).tolist()
+    ranges = {name: range(end - mine.count(name), end) for name, end in zip(names, ends, strict=True)}
+    return Episodes(chosen.dataset[order], chosen.predictor), {name: r for name, r in ranges.items() if r}
 
 
 def choose(data: Path, ids: Sequence[int] | None = None, run: Path | None = None) -> Episodes:

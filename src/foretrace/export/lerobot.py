@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,11 @@ class Layout:
 
 
 def export_lerobot(
-    episodes: Sequence[Episode], out: Path, fps: int | None = None, camera: bool = False
+    episodes: Sequence[Episode],
+    out: Path,
+    fps: int | None = None,
+    camera: bool = False,
+    splits: Mapping[str, range] | None = None,
 ) -> None:
     """Write interactions as one data set, an episode each.
 
@@ -71,6 +75,7 @@ def export_lerobot(
         fps: Frames per second, to which recordings are resampled; by default that of the interactions, which
             must then be sampled alike.
         camera: Whether to render the pictures of a camera beside the table; for simulated interactions only.
+        splits: Which episodes are in which part; by default all are in ``train``.
 
     Raises:
         ExportError: The folder exists, the interactions are not sampled alike, or pictures cannot be had.
@@ -79,7 +84,7 @@ def export_lerobot(
         layout = _layout(episodes, fps, camera)
         rows = _write_data(episodes, layout, folder)
         _write_episodes(rows, folder)
-        _write_description(rows, layout, folder)
+        _write_description(rows, layout, splits or {"train": range(len(rows))}, folder)
 
 
 def _layout(episodes: Sequence[Episode], fps: int | None, camera: bool) -> Layout:
@@ -280,7 +285,9 @@ def _write_episodes(rows: Sequence[dict[str, Any]], folder: Path) -> None:
     pq.write_table(pa.Table.from_pylist(flat), path, compression="snappy")
 
 
-def _write_description(rows: Sequence[dict[str, Any]], layout: Layout, folder: Path) -> None:
+def _write_description(
+    rows: Sequence[dict[str, Any]], layout: Layout, splits: Mapping[str, range], folder: Path
+) -> None:
     """The data set as a whole: what it holds, its one task, its statistics."""
     info = {
         "codebase_version": CODEBASE_VERSION,
@@ -292,7 +299,7 @@ def _write_description(rows: Sequence[dict[str, Any]], layout: Layout, folder: P
         "data_files_size_in_mb": FILE_SIZE // 2**20,
         "video_files_size_in_mb": 200,
         "fps": layout.fps,
-        "splits": {"train": f"0:{len(rows)}"},
+        "splits": {name: f"{part.start}:{part.stop}" for name, part in splits.items()},
         "data_path": DATA_PATH,
         "video_path": None,
         "features": layout.features,

@@ -83,6 +83,7 @@ class Prism(ObjectModel):
         height: float = DEFAULT_HEIGHT,
         bevel: Bevel | None = None,
         tolerance: float | None = None,
+        blunted: float = 0.0,
     ) -> "Prism":
         """The prism whose outline is a silhouette.
 
@@ -93,6 +94,7 @@ class Prism(ObjectModel):
             height: height of the prism [m].
             bevel: chamfer of the lower rim; by default the usual one, smaller for slender or flat objects.
             tolerance: how far the polygon may leave the outline [m]; 1 mm by default, never below 0.75 pixel.
+            blunted: how much of a right-angled corner blur may have taken [m]; at least 3 pixels.
 
         Returns:
             The prism, origin at the silhouette's centroid, x to the right in the image and y up.
@@ -100,7 +102,7 @@ class Prism(ObjectModel):
         Raises:
             ShapeError: for a mask that is empty, shows several objects or an object cut off by the border.
         """
-        corners = silhouette_polygon(mask, metres_per_pixel, tolerance)
+        corners = silhouette_polygon(mask, metres_per_pixel, tolerance, blunted)
         return cls(corners, height, bevel or fitting_bevel(corners, height))
 
     def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:

@@ -1,9 +1,12 @@
 """From a binary image of one object to its outline in metres."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from foretrace.errors import ShapeError
 from foretrace.geometry import cross, mask_outline
@@ -17,7 +20,18 @@ TOLERANCE = 0.001
 TOLERANCE_PIXELS = 0.75
 """The same in pixels, whichever is larger: less would draw the pixels' own steps."""
 BLUNTED = 3.0
-"""How many pixels of a sharp corner may be missing in the image and are put back [pixels]."""
+"""How many pixels of a sharp corner may be missing in the image and are put back [pixels]; the sharper, the more."""
+ODD = 1.0
+"""Points of a side that are further off than this count less [pixels]: a dent bends no side."""
+STRAIGHT, STRAIGHT_SHARE = 0.5, 0.2
+"""Points form one side with a line if their root mean square distance from it is less than this [pixels], or than this
+share of the tolerance: the pixels' steps and the noise of an edge leave about half of that."""
+CORNER_SHARE = 0.2
+"""Points at either end of a side that may be left out, as a share of all."""
+LEAST_SINE = 0.17
+"""Corners sharper than 20 degrees are put back no further than one of these."""
+FIT_ROUNDS = 5
+"""Rounds of fitting a line and weighing its points anew."""
 
 
 def read_silhouette(mask: Shaped[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
@@ -72,12 +86,21 @@ def silhouette_origin(silhouette: Bool[np.ndarray, "rows columns"]) -> Float[np.
 
 
 def silhouette_polygon(
-    mask: Shaped[np.ndarray, "rows columns"], metres_per_pixel: float, tolerance: float | None = None
+    mask: Shaped[np.ndarray, "rows columns"],
+    metres_per_pixel: float,
+    tolerance: float | None = None,
+    blunted: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
     """The polygon of the object in a binary image, origin at its centroid, x right and y up [m].
 
     The outline is simplified; then a line is fitted to the outline along each side and neighbouring lines are
     intersected, which finds the corners to a fraction of a pixel.
+
+    Args:
+        mask: The object white (or True) on black.
+        metres_per_pixel: Scale of the image [m].
+        tolerance: How far the polygon may leave the outline [m]; `TOLERANCE` by default.
+        blunted: How much of a right-angled corner may be missing [m], if more than `BLUNTED` pixels.
 
     Raises:
         ShapeError: if the image does not show one whole object, or the scale is not positive.
@@ -88,9 +111,10 @@ def silhouette_polygon(
     rows, columns = (mask_outline(silhouette) - silhouette_origin(silhouette)).T
     outline = np.column_stack([columns, -rows])[::-1]  # x, y in pixels, counter-clockwise
     pixels = max((TOLERANCE if tolerance is None else tolerance) / metres_per_pixel, TOLERANCE_PIXELS)
-    chosen = simplify_outline(outline, pixels)
+    # Rather too many sides than too few: those that are none are dropped again.
+    chosen = simplify_outline(outline, max(pixels / 2, TOLERANCE_PIXELS))
     corners = outline[chosen]
-    refined = refine_corners(outline, chosen, pixels)
+    refined = refine_corners(outline, chosen, pixels, max(blunted / metres_per_pixel, BLUNTED))
     if len(refined) >= 3 and shapely.Polygon(refined).is_valid:
         corners = refined
     return corners * metres_per_pixel
@@ -106,49 +130,145 @@ def simplify_outline(outline: Float[np.ndarray, "k 2"], tolerance: float) -> lis
 
 
 def refine_corners(
-    outline: Float[np.ndarray, "k 2"], chosen: list[int], tolerance: float
+    outline: Float[np.ndarray, "k 2"], chosen: list[int], tolerance: float, blunted: float = BLUNTED
 ) -> Float[np.ndarray, "n 2"]:
     """Corners where lines fitted to neighbouring sides meet; a corner that would move far stays.
 
-    A short side between two lines that meet close to it is a corner that the pixels have blunted: it is
-    dropped. All in pixels.
+    A side is dropped if its points lie on its neighbours as well, or if it is short and cuts off a corner that pixels
+    or lens have blunted. All in pixels.
+
+    Args:
+        outline: The outline, counter-clockwise.
+        chosen: Indices of points near the corners.
+        tolerance: How far the polygon may leave the outline.
+        blunted: How much of a corner may be missing.
     """
-    reach = max(1.5 * tolerance, BLUNTED)
-    stops = [*chosen[1:], chosen[0]]
-    sides = [fit_line(outline, start, stop) for start, stop in zip(chosen, stops, strict=True)]
-    lengths = np.linalg.norm(outline[stops] - outline[chosen], axis=1)
-    kept: list[int] = []
-    for k in range(len(sides)):
-        after = sides[(k + 1) % len(sides)]
-        before = sides[k - 1]
-        blunted = lengths[k] < 2 * tolerance and (k == 0 or kept[-1:] == [k - 1])
-        meeting = meeting_point(before, after) if blunted else None
-        middle = outline[[chosen[k], stops[k]]].mean(axis=0)
-        if meeting is None or np.linalg.norm(meeting - middle) > reach:
-            kept.append(k)
-    if len(kept) < 3:
-        kept = list(range(len(sides)))
-    corners = outline[[chosen[k] for k in kept]]
-    for i, k in enumerate(kept):
-        meeting = meeting_point(sides[kept[i - 1]], sides[k])
-        if meeting is not None and np.linalg.norm(meeting - corners[i]) <= reach:
-            corners[i] = meeting
+    splits, corners = sorted(chosen), outline[sorted(chosen)]
+    splits, corners = split_sides(outline, splits, corners, range(len(splits)), tolerance, blunted)
+    shortest, straight = 2 * max(tolerance, blunted), max(STRAIGHT, STRAIGHT_SHARE * tolerance)
+    tried: set[tuple[int, ...]] = set()
+    dropped = True
+    while dropped and len(splits) > 3:
+        dropped = False
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+        for k in np.argsort(lengths, kind="stable").tolist():
+            # Side k lies between splits k and k + 1: one split in its middle takes their place.
+            order = [(k + step) % len(splits) for step in range(len(splits))]
+            start, stop = splits[k], splits[order[1]]
+            stretch = (splits[order[-1]], start, stop, splits[order[2]])
+            if stretch in tried:
+                continue
+            tried.add(stretch)
+            side = indices_between(outline, start, stop)
+            fewer = [int(side[len(side) // 2]), *(splits[m] for m in order[2:])]
+            rest = np.concatenate([corners[[k]], corners[order[2:]]])
+            trial = split_sides(outline, fewer, rest, [0], tolerance, blunted)
+            if lies_on(outline, stretch, trial[1], straight, blunted if lengths[k] < shortest else None):
+                splits, corners = split_sides(
+                    outline, *trial, sorted({0, 1, len(fewer) - 1}), tolerance, blunted
+                )
+                dropped = True
+                break
     # Lines of three sides in a row may meet in one point.
     return corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > 0.5]
+
+
+def lies_on(
+    outline: Float[np.ndarray, "k 2"],
+    stretch: tuple[int, ...],
+    corners: Float[np.ndarray, "n 2"],
+    straight: float,
+    blunted: float | None,
+) -> bool:
+    """Whether a side's points lie on a polygon without it.
+
+    Args:
+        outline: The outline.
+        stretch: Indices of its points where the side before begins, the side, the side after, and where that ends.
+        corners: The polygon.
+        straight: Largest root mean square distance from it.
+        blunted: How far the side itself may lie off, where it may be a blunted corner; otherwise all three count.
+    """
+    ring = shapely.LinearRing(corners)
+    gaps = [
+        shapely.distance(ring, shapely.points(outline[indices_between(outline, a, b)]))
+        for a, b in pairwise(stretch)
+    ]
+    if blunted is not None:
+        return bool(gaps[1].max() <= blunted)
+    return bool(max((gap**2).mean() for gap in gaps) <= straight**2)
+
+
+def split_sides(
+    outline: Float[np.ndarray, "k 2"],
+    splits: list[int],
+    corners: Float[np.ndarray, "n 2"],
+    moving: Sequence[int],
+    tolerance: float,
+    blunted: float,
+) -> tuple[list[int], Float[np.ndarray, "n 2"]]:
+    """Where an outline is best split into so many straight sides, near given indices, and the sides' corners.
+
+    Args:
+        outline: The outline.
+        splits: Indices of its points where sides meet, in order.
+        corners: The corners there.
+        moving: Which of them are looked for anew.
+        tolerance: How far the polygon may leave the outline.
+        blunted: How much of a corner may be missing.
+    """
+    corners = corners.copy()
+    for _ in range(FIT_ROUNDS):
+        sides = {
+            k: fit_line(outline, splits[k], splits[(k + 1) % len(splits)], blunted)
+            for k in {side % len(splits) for i in moving for side in (i - 1, i)}
+        }
+        moved = list(splits)
+        for i in moving:
+            before, after = sides[(i - 1) % len(splits)], sides[i]
+            corners[i], meeting = outline[splits[i]], meeting_point(before, after)
+            around = indices_between(outline, splits[i - 1], splits[(i + 1) % len(splits)])[1:-1]
+            if meeting is None or len(around) == 0:
+                continue
+            away = np.linalg.norm(outline[around] - meeting, axis=1)
+            if away.min() <= reach_of(before, after, tolerance, blunted):
+                corners[i], moved[i] = meeting, int(around[away.argmin()])
+        if moved == splits or len(set(moved)) < len(moved):
+            break
+        splits = moved
+    return splits, corners
+
+
+def indices_between(outline: Float[np.ndarray, "k 2"], start: int, stop: int) -> Int[np.ndarray, " m"]:
+    """Indices of a closed outline's points from one to another, both included."""
+    return np.arange(start, stop + 1 if stop > start else stop + len(outline) + 1) % len(outline)
 
 
 Line = tuple[np.ndarray, np.ndarray]
 """A point of the line and its unit direction."""
 
 
-def fit_line(outline: Float[np.ndarray, "k 2"], start: int, stop: int) -> Line:
-    """The line nearest to the outline's points between two indices, in the sense of least squares."""
-    indices = np.arange(start, stop + 1 if stop > start else stop + len(outline) + 1) % len(outline)
-    # The points at a corner belong to neither side.
-    points = outline[indices[1:-1]] if len(indices) > 4 else outline[indices]
-    anchor = points.mean(axis=0)
-    scatter = (points - anchor).T @ (points - anchor)
-    return anchor, np.linalg.eigh(scatter)[1][:, 1]
+def fit_line(outline: Float[np.ndarray, "k 2"], start: int, stop: int, blunted: float) -> Line:
+    """The line nearest to most of the outline's points between two indices, along the outline (Huber, 1964)."""
+    indices = indices_between(outline, start, stop)
+    margin = min(
+        int(blunted), int(CORNER_SHARE * len(indices))
+    )  # the points at a corner belong to neither side
+    points = outline[indices[margin : len(indices) - margin]]
+    weights, anchor, along = np.ones(len(points)), points[0], points[-1] - points[0]
+    for _ in range(FIT_ROUNDS):
+        anchor = weights @ points / weights.sum()
+        away = points - anchor
+        across, along = np.linalg.eigh((weights[:, None] * away).T @ away)[1].T
+        weights = ODD / np.maximum(np.abs(away @ across), ODD)
+    return anchor, along if along @ (outline[stop] - outline[start]) > 0 else -along
+
+
+def reach_of(before: Line, after: Line, tolerance: float, blunted: float) -> float:
+    """How far from what is seen of a corner its two sides may meet [pixels]: blur takes more of a sharper one."""
+    # Sine of half the angle between the sides: directions run along the outline.
+    sharpness = np.sqrt((1 + np.clip(before[1] @ after[1], -1, 1)) / 2)
+    return float(max(1.5 * tolerance, blunted / max(sharpness, LEAST_SINE)))
 
 
 def meeting_point(first: Line, second: Line) -> Float[np.ndarray, "2"] | None:

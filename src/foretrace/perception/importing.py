@@ -26,8 +26,9 @@ from foretrace.perception.markers import (
     picture_fault,
 )
 from foretrace.perception.masks import (
+    cover_by_background,
+    cover_of,
     heights_above_table,
-    mask_by_background,
     mask_by_height,
     pick_object,
 )
@@ -271,15 +272,18 @@ def find_mask(
     camera: PinholeCamera,
     T_table_camera: Float[np.ndarray, "4 4"],
     point: tuple[float, float],
-) -> tuple[Bool[np.ndarray, "rows columns"], float]:
+) -> tuple[Bool[np.ndarray, "rows columns"] | Float[np.ndarray, "rows columns"], float]:
     """The object in the first frame by the film's background or its depth, and where above the table it begins [m].
+
+    By the background: which part of each pixel it covers.
 
     Raises:
         PerceptionError: The film has neither.
     """
     background = film.background()
     if background is not None:
-        return pick_object(mask_by_background(frame.picture, background), point), BEVEL.height
+        cover = cover_by_background(frame.picture, background)
+        return cover_of(cover, pick_object(cover > 0.5, point)), BEVEL.height
     if frame.depth is not None:
         heights = heights_above_table(frame.depth, camera, T_table_camera)
         return pick_object(mask_by_height(heights), point), 2 * MINIMAL_HEIGHT

@@ -16,6 +16,8 @@ LEAST_CHANGE = 14.0
 """A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
 EDGE_DEPTH = 4
 """So many pixels inside what differs, a blurred edge has risen to the object's own colour."""
+BORDER = 3
+"""So far from a mask's border pixels may be covered in part [pixel]."""
 SMALLEST_OBJECT = 400
 """An object of fewer pixels is taken for noise."""
 PLANE_SAMPLES = 20000
@@ -33,7 +35,20 @@ def mask_by_background(
     background: UInt8[np.ndarray, "other_rows other_columns 3"],
     least_change: float = LEAST_CHANGE,
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Pixels that differ from a picture of the same place without the object.
+    """Pixels that differ from a picture of the same place without the object: more than half `cover_by_background`.
+
+    Raises:
+        PerceptionError: The pictures differ in size or in nearly everything.
+    """
+    return cover_by_background(picture, background, least_change) > 0.5
+
+
+def cover_by_background(
+    picture: UInt8[np.ndarray, "rows columns 3"],
+    background: UInt8[np.ndarray, "other_rows other_columns 3"],
+    least_change: float = LEAST_CHANGE,
+) -> Float[np.ndarray, "rows columns"]:
+    """Which part of each pixel something covers that a picture of the same place without the object does not show.
 
     A change of the light as a whole is taken out first: the one gain for each colour that most pixels agree on.
 
@@ -54,7 +69,7 @@ def mask_by_background(
             f"{100 * mask.mean():.0f} % of the picture differ from the background: was the camera moved or the light "
             "switched? take both anew"
         )
-    return mask & (_coverage(now, before, mask) > 0.5)
+    return np.where(mask, np.clip(_coverage(now, before, mask), 0.0, 1.0), 0.0)
 
 
 def _coverage(
@@ -142,6 +157,15 @@ def mask_by_grabcut(
     if not mask.any():
         raise PerceptionError(f"GrabCut finds no object in the box {box}: draw it round the object")
     return mask
+
+
+def cover_of(
+    cover: Float[np.ndarray, "rows columns"], mask: Bool[np.ndarray, "rows columns"]
+) -> Float[np.ndarray, "rows columns"]:
+    """Which part of each pixel one object covers: as was seen near the border of its mask, all of it inside."""
+    whole, near = mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8)
+    inside, beside = cv2.erode(whole, near[1:-1, 1:-1]) > 0, cv2.dilate(whole, near) > 0
+    return np.where(inside, 1.0, np.where(beside, cover, 0.0))
 
 
 def pick_object(
@@ -292,6 +316,8 @@ def object_height(
 
 def _inside(point: tuple[float, float], shape: tuple[int, ...]) -> tuple[int, int]:
     """A point's nearest pixel (column, row)."""
+    if not np.isfinite(point).all():
+        raise PerceptionError(f"point ({point[0]:g}, {point[1]:g}) is no pixel: give column and row")
     column, row = round(point[0]), round(point[1])
     if not (0 <= column < shape[1] and 0 <= row < shape[0]):
         raise PerceptionError(

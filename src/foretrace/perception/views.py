@@ -20,10 +20,14 @@ from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import MINIMAL_HEIGHT, TopDownView
 from foretrace.objects import BEVEL, ObjectModel, Prism, silhouette_origin
 
-GRID = 0.0005
+GRID = 0.00025
 """Side of a pixel of the rectified mask [m]."""
 TOLERANCE = 0.002
 """How far the polygon may leave the outline [m]: less would follow the noise of its edge, and so would directions."""
+BLUNTED = 3.0
+"""How much of a right-angled corner a lens may take [pixel]."""
+SMOOTHING = 1.0
+"""Standard deviation by which the steps of a mask's border are smoothed [pixel]."""
 LARGEST_OBJECT = 1.0
 """No object is larger than this [m]."""
 LARGEST_SNAP = 0.02
@@ -69,7 +73,7 @@ class Sight:
 
 
 def place_object(
-    mask: Bool[np.ndarray, "rows columns"],
+    mask: Bool[np.ndarray, "rows columns"] | Float[np.ndarray, "rows columns"],
     camera: PinholeCamera,
     T_table_camera: Float[np.ndarray, "4 4"],
     height: float,
@@ -79,7 +83,7 @@ def place_object(
     """The prism that a mask shows, on the table.
 
     Args:
-        mask: The object in the picture, as the camera sees it.
+        mask: The object in the picture, as the camera sees it; or, which is finer, how much of each pixel it covers.
         camera: The camera.
         T_table_camera: Its pose.
         height: Height of the object's upper face [m].
@@ -105,10 +109,12 @@ def place_object(
         )
     low, high = reach.min(axis=0) - 4 * GRID, reach.max(axis=0) + 4 * GRID
     size = np.ceil((high - low) / GRID).astype(int)
-    flat = _lay_out(mask, camera, T_table_camera, low, size, height)
-    flat &= _lay_out(mask, camera, T_table_camera, low, size, rim)
+    smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), SMOOTHING)
+    flat = _lay_out(smooth, camera, T_table_camera, low, size, height)
+    flat &= _lay_out(smooth, camera, T_table_camera, low, size, rim)
     try:
-        prism = Prism.from_mask(flat, GRID, height, tolerance=TOLERANCE)
+        blunted = BLUNTED * pixel_size(camera, T_table_camera, reach.mean(axis=0))
+        prism = Prism.from_mask(flat, GRID, height, tolerance=TOLERANCE, blunted=blunted)
         if hull:
             prism = Prism(convex_hull(prism.corners), height, prism.bevel)
     except ShapeError as error:
@@ -119,6 +125,14 @@ def place_object(
     return PlacedObject(prism, T)
 
 
+def pixel_size(
+    camera: PinholeCamera, T_table_camera: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "2"]
+) -> float:
+    """How much of the table a pixel covers at a point, along the line of sight, where it covers most [m]."""
+    away = T_table_camera[:3, 3] - [*point, 0.0]
+    return float(away @ away / away[2] / camera.fx)
+
+
 def convex_hull_indices(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Which of many pixels are corners of their convex hull."""
     points = np.stack([columns, rows], axis=-1).astype(np.int32)
@@ -126,7 +140,7 @@ def convex_hull_indices(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _lay_out(
-    mask: np.ndarray,
+    mask: Float[np.ndarray, "picture_rows picture_columns"],
     camera: PinholeCamera,
     T_table_camera: np.ndarray,
     low: np.ndarray,
@@ -140,7 +154,7 @@ def _lay_out(
     points = np.stack([*np.meshgrid(x, y), np.full((length, width), height)], axis=-1).reshape(-1, 3)
     pixels = camera.project(points, invert_transform(T_table_camera)).astype(np.float32)
     columns, rows = pixels.T.reshape(2, length, width)
-    return cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) >= 0.5
+    return cv2.remap(mask, columns, rows, cv2.INTER_LINEAR) >= 0.5
 
 
 def _largest(flat: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:

@@ -5,7 +5,7 @@ from foretrace.predictor.checkpoint import PREDICTORS, load_predictor, save_chec
 from foretrace.predictor.futures import Futures
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
-from foretrace.predictor.run_folder import part_of
+from foretrace.predictor.run_folder import part_of, parts_of
 from foretrace.predictor.training import RECIPES, TrainConfig, train_predictor
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "TrainConfig",
     "load_predictor",
     "part_of",
+    "parts_of",
     "save_checkpoint",
     "train_predictor",
 ]

@@ -17,7 +17,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from foretrace.errors import TrainingError
+from foretrace.errors import DatasetError, TrainingError
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
@@ -198,6 +198,24 @@ def fingerprint(batch: InteractionBatch, known: Sequence[str] = ()) -> str:
     for name in known:
         digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
     return digest.hexdigest()[:16]
+
+
+def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
+    """Ids of the interactions in each part of a training's split; nothing if it was trained on other data.
+
+    Args:
+        run: Folder of the training.
+        data: All of the data set.
+    """
+    file = Path(run) / SPLIT
+    if not file.is_file():
+        return {}
+    names = [name for name in json.loads(file.read_text(encoding="utf-8")) if name != "fingerprints"]
+    try:
+        batch = data.batch()
+        return {name: part_of(run, batch, name).ids.tolist() for name in names}
+    except (DatasetError, TrainingError):
+        return {}
 
 
 def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test") -> InteractionBatch:

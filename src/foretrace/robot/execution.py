@@ -17,7 +17,7 @@ from foretrace.robot.checks import ArmLimits, Check, check_path, check_start, re
 from foretrace.robot.controller import ArmState, UrController
 from foretrace.robot.filming import Filming
 from foretrace.robot.kinematics import ArmKinematics
-from foretrace.robot.path import ArmPath, plan_approach
+from foretrace.robot.path import LEVER_UP, ArmPath, plan_approach
 from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
 
 LAG = 0.3
@@ -173,7 +173,7 @@ def _move(
     try:
         controller.take_control()
         for leg in [*legs, hold]:
-            if film is not None and leg is legs[-1]:
+            if film is not None and leg.name == LEVER_UP:
                 film.action_start = time.monotonic()
             for sample, set_point in enumerate(leg.joints):
                 state = controller.state()
@@ -185,7 +185,7 @@ def _move(
                     stopped_at = f"{reason}, {leg.name}, sample {sample} of {len(leg.joints)}"
                     break
                 recent.append(set_point)
-            if stopped_at:
+            if stopped_at:  # no leg follows a stop: the way back might be as unsafe as the way on
                 break
     finally:
         outcome = controller.stop()

@@ -1,6 +1,7 @@
 """The arm's joint path for one lever-up on a real table, in legs that each start and end at rest."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,12 +18,14 @@ from foretrace.simulation.engine import tip_transforms
 
 KNOT_PERIOD = 0.04
 """Inverse kinematics is solved at these intervals of the unscaled path; a cubic spline joins the solutions [s]."""
-RETREAT = (-0.05, 0.10)
-"""Where the descent starts: behind and above the start of the lever-up, along the action's x and z [m]."""
+ABOVE = (-0.05, 0.10)
+"""Where the descent starts and the retreat ends: behind and above the start, along the action's x and z [m]."""
 DESCENT_TIME = 2.0
 """Time of the descent, unscaled [s]."""
 APPROACH_SPEED, APPROACH_ACCELERATION = 0.2, 0.5
 """Largest joint speed [rad/s] and acceleration [rad/s^2] on the way to the descent, whatever the scaling."""
+LEVER_UP = "lever-up"
+"""Name of the leg that is the tool path."""
 FILE_FORMAT, FILE_VERSION = "foretrace-base-pose", 1
 
 
@@ -94,7 +97,7 @@ def plan_lever_up(
     lever = tip_transforms(tool_path, _knots(tool_path.duration))
     descent = np.repeat(lever[:1], len(_knots(DESCENT_TIME)), axis=0)
     remaining = 1 - _minimum_jerk(len(descent))
-    descent[:, [0, 2], 3] += remaining[:, None] * np.array(RETREAT)
+    descent[:, [0, 2], 3] += remaining[:, None] * np.array(ABOVE)
     x, y = T_base_action[:2, 3]
     # The simulated arm starts behind the contact point, facing it; the real one may look elsewhere.
     q = np.array(arm.HOME) + np.array([np.arctan2(y, x), 0, 0, 0, 0, 0])
@@ -105,8 +108,18 @@ def plan_lever_up(
     split = len(descent)
     return [
         ArmPath("descent", _resample(np.array(solved[:split]), DESCENT_TIME / speed)),
-        ArmPath("lever-up", _resample(np.array(solved[split:]), tool_path.duration / speed)),
+        ArmPath(LEVER_UP, _resample(np.array(solved[split:]), tool_path.duration / speed)),
     ]
+
+
+def plan_retreat(legs: Sequence[ArmPath]) -> list[ArmPath]:
+    """The way back of `plan_lever_up`'s legs: the object is set down and the blade pulled out, then the arm goes up.
+
+    Args:
+        legs: Descent and lever-up.
+    """
+    descent, lever = legs
+    return [ArmPath("set-down", lever.joints[::-1]), ArmPath("retreat", descent.joints[::-1])]
 
 
 def plan_approach(start: Float[np.ndarray, "6"], goal: Float[np.ndarray, "6"]) -> ArmPath:
