@@ -10,6 +10,7 @@ import numpy as np
 from foretrace.errors import TrainingError
 from foretrace.evaluation.experiments import STARTS
 from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.objects import CORNER_COUNTS
 from foretrace.predictor import EffectPredictor, load_predictor, part_of
 from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.domain import MEASURES, QUANTILES
@@ -182,11 +183,15 @@ def _ranges(predictor: EffectPredictor) -> str:
 
 
 def _families(dataset: Dataset) -> dict[int, str]:
-    """Kind of object of each interaction, by id; the corners of flat ones are counted."""
+    """Kind of object of each interaction, by id; the corners of flat ones are counted, unless they form a curve."""
     kinds = (json.loads(text)["kind"] for text in dataset.table["object"].to_pylist())
     corners, ids = (dataset.table[name].to_pylist() for name in ("num_corners", "id"))
     return {
-        id: f"{kind}, {number} corners" if kind == "prism" else kind
+        id: kind
+        if kind != "prism"
+        else f"prism, {number} corners"
+        if number in CORNER_COUNTS
+        else "round outline"
         for id, kind, number in zip(ids, kinds, corners, strict=True)
     }
 
