@@ -126,7 +126,7 @@ class TrainConfig:
 RECIPES = {
     "lstm": TrainConfig(),
     "one-shot": TrainConfig(
-        predictor="one-shot", features="outline", hidden=128, epochs=150, learning_rate=8e-3
+        predictor="one-shot", features="outline", hidden=128, epochs=150, learning_rate=4e-3
     ),
 }
 """What a kind of predictor is trained with, unless somebody asks for something else; keys are those of PREDICTORS."""
