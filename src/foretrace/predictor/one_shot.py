@@ -51,8 +51,8 @@ DISAGREEMENT = 8.0
 """Where networks and mirror images disagree, so many times their distance is the error to be expected.
 
 They disagree most about objects unlike those learned from. Measured on triangles and quadrangles that were held out, of
-objects beyond the paper's 160: with 4 to 16, regions are as exact there as on known shapes; without, half as wide as
-they should be.
+objects beyond the paper's 160: with 4 to 16, regions are about as exact there as on known shapes; without, they are far
+too narrow.
 """
 SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step looks at: it makes the step cheaper."""
