@@ -31,7 +31,7 @@ def colour_of(number: int) -> np.ndarray:
 
 def record(path: Path, depth: bool = True, colour: bool = True, model: str = "brown_conrady") -> Path:
     """A recording that the library itself makes, of a camera that exists in its memory alone."""
-    rs = pytest.importorskip("pyrealsense2")
+    rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
     device = rs.software_device()
     device.register_info(rs.camera_info.name, "virtual")
     kinds = [
@@ -143,7 +143,7 @@ def test_without_the_library(recording: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_without_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The real library looks for a camera on this machine."""
-    rs = pytest.importorskip("pyrealsense2")
+    rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
     if len(rs.context().query_devices()):
         pytest.skip("a camera is plugged in")
     assert main(["capture", str(tmp_path / "film")]) == 2
@@ -154,7 +154,7 @@ def test_without_a_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 @pytest.fixture
 def plugged_in(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The recording takes the place of a camera: frames and profiles are the library's, the pipeline starts it."""
-    rs = pytest.importorskip("pyrealsense2")
+    rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
     pipeline, config = rs.pipeline, rs.config
 
     class Pipeline:
@@ -205,7 +205,7 @@ def test_filming(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    rs = pytest.importorskip("pyrealsense2")
+    rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
 
     class Silent:
         def start(self, _: Any) -> Any:

@@ -85,7 +85,8 @@ def _library() -> Any:
         import pyrealsense2
     except ImportError as error:
         raise PerceptionError(
-            f"RealSense cameras and their recordings need pyrealsense2 ({error}): `pip install foretrace[realsense]`"
+            f"RealSense cameras and their recordings need pyrealsense2 ({error}): `pip install foretrace[realsense]`, "
+            "and the system's libusb 1.0"
         ) from error
     return pyrealsense2
 
