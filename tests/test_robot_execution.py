@@ -3,6 +3,7 @@
 import csv
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -161,8 +162,10 @@ def test_a_camera_that_is_not_there_is_named(tmp_path):
     ],
 )
 def test_what_goes_wrong_half_way_stops_the_arm(kinematics, recording, event, said, stops):
+    # Where no data come, the last known joints fall behind their path as well: here silence is to be noticed first.
+    watch = replace(WATCH, deviation=0.15) if event == "freeze" else WATCH
     with RunningController(START, HALF, event) as controller, pytest.raises(RobotError, match=said):
-        go(controller.host, kinematics, recording, watch=WATCH, legs=(LEG, BACK))
+        go(controller.host, kinematics, recording, watch=watch, legs=(LEG, BACK))
     assert controller.facts.stops == stops
     assert controller.facts.uploads == 1
     assert HALF <= len(controller.facts.set_points) < HALF + 75
