@@ -300,11 +300,13 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys, options, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_other_physics_are_judged_at_the_same_times(batch):
-    predictor = replace(QUICK, outcomes=("levered", "slipped")).make_predictor(20)
-    split, late = uncertainty.split_of(batch, "shuffled", 0), replace(batch, times=2 * batch.times)
-    with pytest.raises(DatasetError, match=r"samples up to .* s, those learned from .*: simulate both"):
-        uncertainty.measure(predictor, batch, split, 0, samples=2, unlike=late)
+def test_other_physics_are_judged_at_the_same_times(folder):
+    batch = uncertainty.load(folder)
+    assert len(uncertainty.load(folder, like=batch)) == len(batch)
+    with pytest.raises(
+        DatasetError, match=r"samples up to .* s, the data that are learned from .*: simulate both"
+    ):
+        uncertainty.load(folder, like=replace(batch, times=2 * batch.times))
 
 
 def test_data_without_motions_are_refused(tmp_path):

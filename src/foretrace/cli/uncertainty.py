@@ -60,7 +60,7 @@ def evaluate_uncertainty(
     config = replace(experiment.RECIPE, threads=threads, device=device)
     config = config if epochs is None else replace(config, epochs=epochs)
     batch = experiment.load(data)
-    other = None if unlike is None else experiment.load(unlike)
+    other = None if unlike is None else experiment.load(unlike, like=batch)
     parts = {
         (setting, seed): experiment.split_of(batch, setting, seed, held_out)
         for setting in dict.fromkeys(splits)

@@ -38,16 +38,25 @@ RECIPE = RECIPES[OneShotPredictor.label]
 """What predictors are trained with; outcomes and seed are replaced."""
 
 
-def load(data: str | Path) -> InteractionBatch:
+def load(data: str | Path, like: InteractionBatch | None = None) -> InteractionBatch:
     """All interactions that have a motion to learn from, whatever became of the objects.
 
+    Args:
+        data: Folder of the data set.
+        like: Others that have to be sampled at the same times.
+
     Raises:
-        DatasetError: There is no data set, or none of its interactions has two samples.
+        DatasetError: There is no data set, none of its interactions has two samples, or they are sampled otherwise.
     """
     batch = Dataset.open(data).batch()
     batch = batch[valid_lengths(batch) >= 2]
     if len(batch) == 0:
         raise DatasetError(f"no interaction of {data} has a motion of two samples: simulate more objects")
+    if like is not None and not np.array_equal(batch.times, like.times):
+        raise DatasetError(
+            f"{data} has {len(batch.times)} samples up to {batch.times[-1]:g} s, the data that are learned from "
+            f"{len(like.times)} up to {like.times[-1]:g} s: simulate both with the same settings"
+        )
     return batch
 
 
@@ -101,8 +110,8 @@ def measure(
         split: Those of its training. The validation part fits the forecasts that its samples are compared with.
         seed: Seed of the samples.
         samples: Motions drawn at random for each interaction.
-        unlike: Interactions with other physics than those learned from, with the same sample times. Of these, only what
-            observed samples are worth is judged; their metrics begin with `UNLIKE`.
+        unlike: Interactions with other physics than those learned from, sampled alike. Of these, only what observed
+            samples are worth is judged; their metrics begin with `UNLIKE`.
 
     Returns:
         ``metric``, ``group`` (`uncertainty_metrics.ALL` or an outcome; of ``confusion``, what happened and what was
@@ -127,12 +136,6 @@ def measure(
             found += test.means(f"{name}_{metric}", values)
     found += judge_observed(predictor, test)
     if unlike is not None:
-        if not np.array_equal(unlike.times, batch.times):
-            raise DatasetError(
-                f"the interactions unlike those learned from have {len(unlike.times)} samples up to "
-                f"{unlike.times[-1]:g} s, those learned from {len(batch.times)} up to {batch.times[-1]:g} s: simulate "
-                "both with the same settings"
-            )
         other = Part.of(predictor, unlike[np.isin(unlike.outcome, predictor.outcomes)])
         found += [(UNLIKE + metric, *row) for metric, *row in judge_observed(predictor, other)]
     return pd.DataFrame(found, columns=["metric", "group", "level", "value"])

@@ -39,12 +39,12 @@ def terminal(epochs: int, visible: bool) -> Iterator[tuple[Callable[[str], None]
         task = bar.add_task("", total=epochs)
 
         def show(row: dict[str, Any], done: Progress) -> None:
-            best = (
+            kept = (
                 done.history[done.best_epoch - 1]["validation_full_cm"] if done.best_epoch else float("nan")
             )
             text = (
                 f"loss {row['train_loss']:.5f}, validation {row['validation_full_cm']:.2f} cm "
-                f"(best {best:.2f} cm, epoch {done.best_epoch})"
+                f"(kept: {kept:.2f} cm, epoch {done.best_epoch})"
             )
             bar.update(task, completed=done.epoch, description=text)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from foretrace.predictor.futures import (
 )
 from foretrace.predictor.hinges import NUM_VALUES, PROBES, Hinges, find_hinges
 from foretrace.predictor.known import given_values
+from foretrace.predictor.members import Members
 from foretrace.predictor.states import Effects, decode_poses
 
 ODD = (1, 3, 5)
@@ -56,8 +56,6 @@ too narrow.
 """
 SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step looks at: it makes the step cheaper."""
-MANY = 256
-"""From so many rows on, bringing tensors into oneDNN's own layout is worth it."""
 
 
 @dataclass(frozen=True)
@@ -92,50 +90,6 @@ class OneShotConfig:
                 raise TrainingError(f"unknown outcome {name!r}; choose from {', '.join(Outcome)}")
         if not self.outcomes:
             raise TrainingError("there is no outcome to learn: name at least one")
-
-
-class Members(nn.Module):
-    """Networks of one shape side by side: rectified layers that work on all of them in one product.
-
-    Args:
-        members: How many.
-        sizes: Numbers in and out, and the hidden units in between.
-    """
-
-    def __init__(self, members: int, sizes: tuple[int, ...]):
-        super().__init__()
-        pairs = list(pairwise(sizes))
-        # Variances are kept from layer to layer (Glorot and Bengio, 2010); every motion starts as the mean one.
-        bounds = [(3 / enter) ** 0.5 for enter, _ in pairs[:-1]] + [0.0]
-        self.members = members
-        # A row for each unit of each member: what optimisers take for a layer's weights.
-        self.weights = nn.ParameterList(
-            torch.empty(members * leave, enter).uniform_(-1, 1) * bound
-            for (enter, leave), bound in zip(pairs, bounds, strict=True)
-        )
-        self.biases = nn.ParameterList(torch.zeros(members * leave) for _, leave in pairs)
-
-    def forward(self, x: Float[Tensor, "members batch enter"]) -> Float[Tensor, "members batch leave"]:
-        """Every member's answer to its own rows."""
-        many = torch.is_inference_mode_enabled() and x.device.type == "cpu" and x.shape[1] >= MANY
-        if many and torch.backends.mkldnn.is_available():
-            return self._in_onednn(x)
-        last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            weight, bias = weight.unflatten(0, (self.members, -1)), bias.view(self.members, 1, -1)
-            x = torch.baddbmm(bias, x, weight.mT)
-            x = x if layer == last else F.silu(x)
-        return x
-
-    def _in_onednn(self, x: Tensor) -> Tensor:
-        """The same, where nothing is learned or exported, by a library that takes half the time for many rows."""
-        said = list(x)
-        last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            own = zip(said, weight.chunk(self.members), bias.chunk(self.members), strict=True)
-            said = [F.linear(*(part.to_mkldnn() for part in parts)).to_dense() for parts in own]
-            said = said if layer == last else [F.silu(one, inplace=True) for one in said]
-        return torch.stack(said)
 
 
 class Said(NamedTuple):

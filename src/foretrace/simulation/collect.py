@@ -1,8 +1,8 @@
 """Many lever-ups into one data set: in parallel, reproducibly, and so that no crash destroys what is done.
 
 Every object is levered at two points of each edge (paper, section 4), or of what counts as one; a recipe says which
-objects. Trial ``id`` of a
-configuration is always the same object, action and seed, whoever simulates it and in whatever order.
+objects. Trial ``id`` of a configuration is always the same object, action and seed, whoever simulates it and in
+whatever order.
 """
 
 import json
