@@ -12,7 +12,8 @@ from foretrace.actions import Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
-from foretrace.evaluation.protocol import Recipe, measure_errors
+from foretrace.evaluation.experiments import measure_errors
+from foretrace.evaluation.protocol import Recipe
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed

@@ -12,17 +12,9 @@ from rich.console import Console
 import factories
 from foretrace.errors import ResultsError, TrainingError
 from foretrace.evaluation import protocol
-from foretrace.evaluation.experiments import evaluate_predictor
-from foretrace.evaluation.protocol import (
-    EXPERIMENTS,
-    Recipe,
-    count_missing,
-    load_levered,
-    measure_errors,
-    plan,
-    run_protocol,
-    split_of,
-)
+from foretrace.evaluation.comparisons import EXPERIMENTS, plan, split_of
+from foretrace.evaluation.experiments import evaluate_predictor, measure_errors
+from foretrace.evaluation.protocol import Recipe, count_missing, load_levered, run_protocol
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, read_results
 from foretrace.evaluation.runner import run_trials
 from foretrace.features import FEATURES

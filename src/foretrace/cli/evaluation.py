@@ -78,9 +78,10 @@ def evaluate_paper(
     from dataclasses import replace
 
     from foretrace.evaluation import protocol
+    from foretrace.evaluation.comparisons import plan
     from foretrace.evaluation.results import read_results
 
-    trials = protocol.plan(experiments or None, features or None, settings or None, seeds)
+    trials = plan(experiments or None, features or None, settings or None, seeds)
     recipe = protocol.Recipe(proportional=proportional)
     if epochs is not None:
         training, one_shot = (replace(config, epochs=epochs) for config in (recipe.training, recipe.one_shot))

@@ -3,12 +3,15 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
 
+from foretrace.evaluation.results import Metrics
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import EffectPredictor
 from foretrace.predictor.base import ImaginedBatch, Start
+from foretrace.predictor.known import observed_values
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance, rotation_error
 
@@ -106,3 +109,30 @@ def _summary(errors: np.ndarray) -> dict[str, float | int]:
         return {"count": 0, "mean_cm": np.nan, "median_cm": np.nan, "p95_cm": np.nan}
     mean, median, p95 = np.mean(known), np.median(known), np.percentile(known, 95)
     return {"count": len(known), "mean_cm": float(mean), "median_cm": float(median), "p95_cm": float(p95)}
+
+
+def measure_errors(
+    predictor: EffectPredictor, batch: InteractionBatch, inputs: Shaped[Tensor, "batch ..."]
+) -> Metrics:
+    """Errors of trajectories imagined from the observed first sample (paper, section 5.2), in cm.
+
+    Args:
+        predictor: The predictor.
+        batch: What it is judged by.
+        inputs: The inputs of its features for that.
+
+    Returns:
+        ``full`` and ``final``, means over the interactions; ``full_median`` and ``final_median``. Of a predictor of
+        poses also ``rotation`` and ``rotation_median`` [degrees], and ``add`` and ``add_median`` [cm].
+    """
+    features = predictor.add_known(
+        predictor.compute_features(inputs), observed_values(batch, predictor.known)
+    )
+    imagined = predictor.imagine_effects(features, batch.com[:, 0])
+    valid = valid_samples(batch)
+    truth = np.where(valid[..., None], batch.com, np.nan)
+    errors = {name: 100 * np.asarray(distance(imagined.com, truth)) for name, distance in METRICS.items()}
+    if imagined.pose is not None:
+        errors |= pose_errors(imagined.pose, batch, valid)
+    means = {name: float(np.mean(values)) for name, values in errors.items()}
+    return means | {f"{name}_median": float(np.median(values)) for name, values in errors.items()}

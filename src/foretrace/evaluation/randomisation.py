@@ -21,7 +21,8 @@ from rich.console import Console
 from torch import Tensor
 
 from foretrace.errors import ResultsError
-from foretrace.evaluation.protocol import Recipe, load_levered, measure_errors
+from foretrace.evaluation.experiments import measure_errors
+from foretrace.evaluation.protocol import Recipe, load_levered
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_machine
 from foretrace.evaluation.runner import Failure, run_trials
 from foretrace.evaluation.stand_in import Observation, StandIn, hull_of
