@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MANY = 256
-"""From so many rows on, bringing tensors into oneDNN's own layout is worth it."""
+"""From so many rows on, networks are better asked one after the other."""
 
 
 class Members(nn.Module):
@@ -34,9 +34,8 @@ class Members(nn.Module):
 
     def forward(self, x: Float[Tensor, "members batch enter"]) -> Float[Tensor, "members batch leave"]:
         """Every member's answer to its own rows."""
-        many = torch.is_inference_mode_enabled() and x.device.type == "cpu" and x.shape[1] >= MANY
-        if many and torch.backends.mkldnn.is_available():
-            return self._in_onednn(x)
+        if torch.is_inference_mode_enabled() and x.shape[1] >= MANY:
+            return self._in_turn(x)
         last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             weight, bias = weight.unflatten(0, (self.members, -1)), bias.view(self.members, 1, -1)
@@ -44,12 +43,15 @@ class Members(nn.Module):
             x = x if layer == last else F.silu(x)
         return x
 
-    def _in_onednn(self, x: Tensor) -> Tensor:
-        """The same, where nothing is learned or exported, by a library that takes half the time for many rows."""
-        said = list(x)
-        last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            own = zip(said, weight.chunk(self.members), bias.chunk(self.members), strict=True)
-            said = [F.linear(*(part.to_mkldnn() for part in parts)).to_dense() for parts in own]
-            said = said if layer == last else [F.silu(one, inplace=True) for one in said]
-        return torch.stack(said)
+    def _in_turn(self, x: Tensor) -> Tensor:
+        """The same, network after network: what passes between the layers of one stays in the processor's cache."""
+        layers = [
+            tuple(zip(w.chunk(self.members), b.chunk(self.members), strict=True))
+            for w, b in zip(self.weights, self.biases, strict=True)
+        ]
+        answers = []
+        for number, answer in enumerate(x):
+            for layer in layers[:-1]:
+                answer = F.silu(F.linear(answer, *layer[number]), inplace=True)
+            answers.append(F.linear(answer, *layers[-1][number]))
+        return torch.stack(answers)

@@ -366,10 +366,13 @@ class OneShotPredictor(EffectPredictor):
         odds = said.odds.flatten(3).log_softmax(dim=-1).view_as(said.odds).mean(dim=(0, 2))
         # What the motion in the mirror is here.
         seen = torch.stack([torch.ones_like(self.parity), self.parity])[: hinges.values.shape[1]]
-        weights = said.weights * seen[:, None, None]
-        mean = weights.mean(dim=(0, 2))
+        # Member by member: all of them at once would not fit into the processor's cache.
+        weights = [own * seen[:, None, None] for own in said.weights]
+        mean = torch.stack([own.mean(dim=1) for own in weights]).mean(dim=0)
         sizes = self.motions[..., :3].square().sum(dim=2).mean(dim=1)
-        apart = ((weights - mean[:, None]).square() @ sizes).mean(dim=(0, 2))
+        apart = torch.stack([((own - mean[:, None]).square() @ sizes).mean(dim=1) for own in weights]).mean(
+            dim=0
+        )
         expected = said.error.mean(dim=(0, 2)).clamp(max=LARGEST_ERROR).exp() * self.state_scale[0]
         return Mixture(
             com=com,
