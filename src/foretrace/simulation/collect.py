@@ -37,6 +37,8 @@ from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import NOTHING, Randomisation
 from foretrace.simulation.recipes import RECIPES
 
+MOST = 1_000_000
+"""Objects, and contacts at each edge, that a data set may have."""
 SHARD_SIZE = 100
 """Interactions in one file."""
 CHUNK_SIZE = 10
@@ -66,8 +68,8 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         for name in ("objects", "contacts_per_edge"):
-            if getattr(self, name) < 1:
-                raise SimulationError(f"{name} is {getattr(self, name)}, it must be at least 1")
+            if not 1 <= getattr(self, name) <= MOST:
+                raise SimulationError(f"{name} is {getattr(self, name)}: give a number from 1 to {MOST}")
         if self.seed < 0:
             raise SimulationError(f"seed is {self.seed}, it must not be negative")
         if self.recipe not in RECIPES:
