@@ -1,3 +1,4 @@
+import contextlib
 import hashlib
 import json
 import os
@@ -39,7 +40,8 @@ def fake_trial(config: CollectConfig, id: int) -> Interaction:
 
 
 def slow_trial(config: CollectConfig, id: int) -> Interaction:
-    time.sleep(0.02)
+    """The last one does not end before the test does, however busy the machine is."""
+    time.sleep(600.0 if id == 207 else 0.02)
     return fake_trial(config, id)
 
 
@@ -379,7 +381,8 @@ def test_kill_9_loses_only_the_shards_in_work(reference, tmp_path):
         assert 1 <= len(done) < 3
         collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
     finally:
-        os.killpg(process.pid, signal.SIGKILL)  # its workers, should they still be there
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # its workers, should they still be there
     assert done.items() <= shards_of(folder).items()
     assert shards_of(folder) == shards_of(reference)
     assert examine(folder).findings == ()
