@@ -264,6 +264,15 @@ def test_a_file_in_the_way_of_an_output_is_told_in_one_line(command, folder, tmp
     assert f"cannot use {tmp_path / 'file'}" in printed
 
 
+def test_ctrl_c_while_a_compiled_module_is_loaded_is_no_error(monkeypatch, capsys):
+    def interrupted():
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setitem(cli.COMMANDS, "interrupted", interrupted)
+    assert cli.main(["interrupted"]) == 130
+    assert capsys.readouterr().err == ""
+
+
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     command = [
         sys.executable,

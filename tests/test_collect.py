@@ -388,6 +388,25 @@ def test_kill_9_loses_only_the_shards_in_work(reference, tmp_path):
     assert examine(folder).findings == ()
 
 
+def deaf_trial(config: CollectConfig, id: int) -> Interaction:
+    if signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []):
+        raise SimulationError("Ctrl-C would have been heard")
+    return fake_trial(config, id)
+
+
+def test_workers_never_hear_ctrl_c_and_the_parent_does(tmp_path):
+    code = (
+        "import signal, test_collect; from foretrace.simulation.collect import collect\n"
+        f"collect(test_collect.SMALL, {str(tmp_path)!r}, workers=2, simulate=test_collect.deaf_trial)\n"
+        "assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_progress_is_reported_in_plain_lines_without_a_terminal(tmp_path, monkeypatch):
     monkeypatch.setattr(collecting, "PLAIN_REPORT_PERIOD", 0.0)
     console = Console(file=(tmp_path / "log").open("w+"), force_terminal=False, width=40)

@@ -87,6 +87,8 @@ COMMANDS: dict[str, Command | Group] = {
 """Every command by its name."""
 
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
 OUTPUT_CLOSED = 141
 """Exit status where whoever read the output has closed it, as `head` does: what a shell says of SIGPIPE."""
 
@@ -137,7 +139,11 @@ def _run(arguments: Sequence[str]) -> int:
         except ForetraceError as error:
             return _refuse(str(error))
         except KeyboardInterrupt:
-            return 130
+            return INTERRUPTED
+        except ImportError as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while a compiled module was loaded
+                return INTERRUPTED
+            raise
     return status or 0
 
 
