@@ -266,7 +266,10 @@ def test_a_file_in_the_way_of_an_output_is_told_in_one_line(command, folder, tmp
 
 def test_ctrl_c_while_a_compiled_module_is_loaded_is_no_error(monkeypatch, capsys):
     def interrupted():
-        raise ImportError("initialization failed") from KeyboardInterrupt()
+        try:
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+        except ImportError as error:
+            raise ImportError("initialization failed") from error
 
     monkeypatch.setitem(cli.COMMANDS, "interrupted", interrupted)
     assert cli.main(["interrupted"]) == 130

@@ -141,8 +141,11 @@ def _run(arguments: Sequence[str]) -> int:
         except KeyboardInterrupt:
             return INTERRUPTED
         except ImportError as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while a compiled module was loaded
-                return INTERRUPTED
+            cause: BaseException | None = error
+            while cause is not None:
+                if isinstance(cause, KeyboardInterrupt):  # while a compiled module was loaded
+                    return INTERRUPTED
+                cause = cause.__cause__ or cause.__context__
             raise
     return status or 0
 
