@@ -3,11 +3,16 @@
 import os
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-# No deadline: how long an example takes says more about the machine than about the code. Continuous integration tries
-# the same examples every time; elsewhere new ones are searched for.
-settings.register_profile("foretrace", deadline=None, derandomize=bool(os.environ.get("CI")))
+# Neither a deadline nor a check of how long examples take to draw: that says more about the machine than about the
+# code. Continuous integration tries the same examples every time; elsewhere new ones are searched for.
+settings.register_profile(
+    "foretrace",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize=bool(os.environ.get("CI")),
+)
 settings.load_profile("foretrace")
 
 

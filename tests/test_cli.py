@@ -226,6 +226,56 @@ def test_help_imports_nothing_slow():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize(
+    "printing",
+    [
+        "main(['--version'])",
+        "main(['simulate', '--help'])",
+        "main(['said'])",
+        "main(['tabulated'])",
+    ],
+)
+def test_a_reader_that_has_gone_ends_a_command_in_silence(printing):
+    code = (
+        "import sys; from rich.console import Console; from foretrace import cli; from foretrace.cli import main\n"
+        "def said(): print('line\\n' * 100_000)\n"
+        "def tabulated(): Console().print('line\\n' * 10_000)\n"
+        "cli.COMMANDS |= {'said': said, 'tabulated': tabulated}\n"
+        f"sys.exit({printing})"
+    )
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as output:
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment(), stdout=output, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.parametrize("command", ["describe --out", "show --id 3 --out"])
+def test_a_file_in_the_way_of_an_output_is_told_in_one_line(command, folder, tmp_path, capsys):
+    name, *options = command.split()
+    (tmp_path / "file").write_text("kept")
+    capsys.readouterr()
+    assert cli.main([name, str(folder), *options, str(tmp_path / "file" / "output.png")]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("foretrace: error: ")
+    assert printed.count("\n") == 1
+    assert f"cannot use {tmp_path / 'file'}" in printed
+
+
+def test_ctrl_c_while_a_compiled_module_is_loaded_is_no_error(monkeypatch, capsys):
+    def interrupted():
+        try:
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+        except ImportError as error:
+            raise ImportError("initialization failed") from error
+
+    monkeypatch.setitem(cli.COMMANDS, "interrupted", interrupted)
+    assert cli.main(["interrupted"]) == 130
+    assert capsys.readouterr().err == ""
+
+
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     command = [
         sys.executable,

@@ -1,3 +1,4 @@
+import contextlib
 import hashlib
 import json
 import os
@@ -39,7 +40,8 @@ def fake_trial(config: CollectConfig, id: int) -> Interaction:
 
 
 def slow_trial(config: CollectConfig, id: int) -> Interaction:
-    time.sleep(0.02)
+    """The last one does not end before the test does, however busy the machine is."""
+    time.sleep(600.0 if id == 207 else 0.02)
     return fake_trial(config, id)
 
 
@@ -379,10 +381,30 @@ def test_kill_9_loses_only_the_shards_in_work(reference, tmp_path):
         assert 1 <= len(done) < 3
         collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
     finally:
-        os.killpg(process.pid, signal.SIGKILL)  # its workers, should they still be there
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # its workers, should they still be there
     assert done.items() <= shards_of(folder).items()
     assert shards_of(folder) == shards_of(reference)
     assert examine(folder).findings == ()
+
+
+def deaf_trial(config: CollectConfig, id: int) -> Interaction:
+    if signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []):
+        raise SimulationError("Ctrl-C would have been heard")
+    return fake_trial(config, id)
+
+
+def test_workers_never_hear_ctrl_c_and_the_parent_does(tmp_path):
+    code = (
+        "import signal, test_collect; from foretrace.simulation.collect import collect\n"
+        f"collect(test_collect.SMALL, {str(tmp_path)!r}, workers=2, simulate=test_collect.deaf_trial)\n"
+        "assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_progress_is_reported_in_plain_lines_without_a_terminal(tmp_path, monkeypatch):

@@ -1,7 +1,9 @@
 import json
 import os
+import threading
 import time
 import warnings
+import weakref
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -229,6 +231,21 @@ def test_a_missing_or_corrupt_shard_is_named(folder, damage, message):
         Dataset.open(folder)
 
 
+def test_no_other_thread_holds_on_to_a_shard_that_was_read(folder, monkeypatch):
+    # Such a thread aborts the process if that ends just then.
+    reader, let_go = pa.BufferReader, []
+
+    def watched(content):
+        array = np.frombuffer(content, dtype=np.uint8)
+        weakref.finalize(array, lambda: let_go.append(threading.current_thread()))
+        return reader(array)
+
+    monkeypatch.setattr(storage.pa, "BufferReader", watched)
+    for count in range(1, 21):
+        storage.read_shard(folder, storage.shard_name(0))
+        assert let_go == [threading.main_thread()] * count
+
+
 def test_a_shard_of_another_schema_is_refused(folder):
     table, _ = storage.read_shard(folder, storage.shard_name(0))
     name = storage.shard_name(0)
@@ -328,8 +345,8 @@ def test_only_one_process_writes(folder):
 def test_two_thousand_rows_open_within_a_second(tmp_path, interactions):
     many = [replace(interactions[k % 10], id=k) for k in range(2000)]
     write_dataset(tmp_path / "many", many, shard_size=100)
-    begun = time.perf_counter()
+    begun = time.process_time()  # what else the machine does is not counted
     dataset = Dataset.open(tmp_path / "many")
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     assert len(dataset) == 2000
-    assert seconds < 2.0, "a second on an idle machine; twice that is leeway for a busy one"
+    assert seconds < 1.0

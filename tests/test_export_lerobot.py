@@ -245,6 +245,8 @@ def test_recordings_of_other_sampling_are_refused_or_resampled(tmp_path):
         export_lerobot(episodes, tmp_path / "other", fps=10, camera=True)
     with pytest.raises(ExportError, match="0 frames per second"):
         export_lerobot(episodes, tmp_path / "other", fps=0)
+    with pytest.raises(ExportError, match="1000000000 frames per second: give a number from 1 to 1000"):
+        export_lerobot(episodes, tmp_path / "other", fps=1_000_000_000)
 
 
 def test_large_data_sets_are_split_into_files(episodes, tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+import factories
 from foretrace.actions import LeverUp
 from foretrace.cli import main
 from foretrace.cli.recordings import LookedAt, look_at_photo
@@ -18,6 +19,7 @@ from foretrace.geometry import rotation_angle
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
+from foretrace.interactions.film_folder import FilmNotes, Frame, write_film
 from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Outcome
@@ -25,8 +27,9 @@ from foretrace.interactions.recorded import add_recorded
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Prism
 from foretrace.perception.films import open_film
-from foretrace.perception.importing import Contact, Imported, import_film
+from foretrace.perception.importing import Contact, ImportConfig, Imported, import_film
 from foretrace.perception.markers import MarkerLayout
+from foretrace.perception.overlay import write_video
 from foretrace.simulation.film import FilmConfig, FilmTruth, film_lever_up
 from foretrace.simulation.lens import Faults
 
@@ -266,5 +269,57 @@ def test_outcomes_from_motion_alone_agree_with_those_that_saw_the_blade(film: tu
 def test_only_mujoco_films() -> None:
     simulation = dataclasses.replace(CONFIG.simulation)
     assert simulation.engine == "mujoco"
-    with pytest.raises(SimulationError, match="at least 1 exposure"):
-        FilmConfig(exposures=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--width 3", "width = 3, give a number from 64 to 7680"),
+        ("--width 100000", "width = 100000, give"),
+        ("--fps 0.001", "frames_per_second = 0.001, give a number from 1 to 100"),
+        ("--fps nan", "frames_per_second = nan, give"),
+        ("--distance 0", "distance = 0.0, give a number from 0.1 to 10"),
+        ("--distance inf", "distance = inf, give"),
+        ("--slant 2", "slant = 2.0, give a number from 0 to 1.5"),
+        ("--slant -0.1", "slant = -0.1, give"),
+        ("--azimuth nan", "azimuth = nan, give"),
+        ("--depth-every -1", "depth_every = -1, give a number from 0"),
+        ("--board -1", "--board is -1: give a number from 0"),
+        ("--seed -1", "--seed is -1: give a number from 0"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused_before_anything_is_written(
+    options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "data", tmp_path / "film"
+    add_recorded(data, factories.fake_lever_up(PRISM, ACTION), {})
+    assert main(["film", str(data), "0", "--out", str(out), *options.split()]) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert message in printed
+    assert not out.exists()
+
+
+def test_a_film_does_not_take_the_place_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "film"
+    out.write_text("kept")
+    assert main(["film", str(tmp_path), "0", "--out", str(out)]) == 2
+    assert f"{out} is in use" in capsys.readouterr().err
+    assert out.read_text() == "kept"
+
+
+def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    frames = [Frame(0.0, np.zeros((4, 4, 3), np.uint8))]
+    (
+        tmp_path / "colour-00000.jpg"
+    ).mkdir()  # a folder is where the picture should be, as a full disk would be
+    with pytest.raises(PerceptionError, match=r"cannot write .*colour-00000\.jpg"):
+        write_film(tmp_path, frames, FilmNotes())
+    (tmp_path / "film.mp4").mkdir()
+    with pytest.raises(PerceptionError, match=r"cannot write .*film\.mp4: check the folder"):
+        write_video(tmp_path / "film.mp4", [np.zeros((64, 64, 3), np.uint8)] * 100, 10.0)
+
+
+def test_a_start_that_is_no_time_is_refused() -> None:
+    with pytest.raises(PerceptionError, match="start = nan: give a time stamp"):
+        ImportConfig(start=float("nan"))

@@ -140,8 +140,8 @@ def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording,
 
 
 def test_a_camera_that_ends_early_is_told(video, tmp_path):
-    with pytest.warns(UserWarning, match="no more pictures"), Filming(str(video), tmp_path / "film"):
-        time.sleep(0.2)
+    with pytest.warns(UserWarning, match="no more pictures"), Filming(str(video), tmp_path / "film") as film:
+        film._thread.join(60)
     assert len((tmp_path / "film" / "timestamps.csv").read_text().splitlines()) == 2
 
 

@@ -417,6 +417,7 @@ def test_more_objects_and_repetitions_leave_the_others_as_they_are(predictor) ->
         (["--silhouettes", "{tmp}/nowhere"], "is no folder"),
         (["--prisms", "{tmp}/none.json"], "cannot read prisms"),
         (["--size", "0"], "--size is 0"),
+        (["--height", "inf"], "--height is inf"),
         (["--out", "{tmp}/run/config.json"], "is a file"),
     ],
 )

@@ -5,6 +5,7 @@ signature and the help from its docstring. Whatever is slow to import is importe
 ``foretrace --help`` answers at once.
 """
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -86,13 +87,37 @@ COMMANDS: dict[str, Command | Group] = {
 """Every command by its name."""
 
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+OUTPUT_CLOSED = 141
+"""Exit status where whoever read the output has closed it, as `head` does: what a shell says of SIGPIPE."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
     0: done. 1: `doctor` has something left to mend, or trainings of `evaluate paper` failed. 2: an error, printed as
-    one line. 130: interrupted.
+    one line. 130: interrupted. 141: the output was closed.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        try:
+            return _run(sys.argv[1:] if arguments is None else arguments)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Python's own flush at exit would complain.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.dup2(nowhere, sys.stderr.fileno())
+        return OUTPUT_CLOSED
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # rich has silenced itself, with exit status 1
+            return OUTPUT_CLOSED
+        raise
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """One command; its errors are told in one line."""
     if list(arguments) == ["--version"]:
         print(f"foretrace {foretrace.__version__}")
         return 0
@@ -105,12 +130,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 description="Predict how an object will move before the robot touches it.",
                 args=arguments,
             )
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            # A folder in place of a file, no permission, a full disk: the system's word for it is enough.
+            where = "" if error.filename is None else f"cannot use {error.filename}: "
+            return _refuse(f"{where}{error.strerror or error}: check path, permissions and free space")
         except ForetraceError as error:
-            say(f"error: {' '.join(str(error).split())}")
-            return 2
+            return _refuse(str(error))
         except KeyboardInterrupt:
-            return 130
+            return INTERRUPTED
+        except ImportError as error:
+            cause: BaseException | None = error
+            while cause is not None:
+                if isinstance(cause, KeyboardInterrupt):  # while a compiled module was loaded
+                    return INTERRUPTED
+                cause = cause.__cause__ or cause.__context__
+            raise
     return status or 0
+
+
+def _refuse(reason: str) -> int:
+    say(f"error: {' '.join(reason.split())}")
+    return 2
 
 
 def _choice(commands: Mapping[str, Command | Group]) -> Any:

@@ -35,7 +35,6 @@ def capture(
     import signal
     import threading
 
-    import cv2
     import numpy as np
 
     from foretrace.errors import PerceptionError
@@ -43,6 +42,8 @@ def capture(
     from foretrace.interactions.film_folder import FilmNotes, write_film
     from foretrace.perception.realsense import CaptureConfig, LiveCamera
 
+    if not 0 < seconds < float("inf"):
+        raise PerceptionError(f"--seconds is {seconds}: give a number above 0; Ctrl-C ends the film earlier")
     taken = out / (film_folder.BACKGROUND if background else film_folder.TIMES)
     if taken.exists():
         raise PerceptionError(f"{taken} is there already: choose another folder")
@@ -50,7 +51,7 @@ def capture(
     with LiveCamera(CaptureConfig(width, height, fps, 0 if background else depth_every, serial)) as camera:
         if background:
             pictures = [frame.picture for frame in camera.frames(lambda time: time > 0.5)]
-            cv2.imwrite(str(taken), np.rint(np.mean(pictures, axis=0)).astype(np.uint8))
+            film_folder.write_picture(taken, np.rint(np.mean(pictures, axis=0)).astype(np.uint8))
             print(taken)
             return
         stop = threading.Event()

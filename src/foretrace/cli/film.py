@@ -48,7 +48,7 @@ def film(
 
     import numpy as np
 
-    from foretrace.errors import DatasetError, PerceptionError
+    from foretrace.errors import DatasetError, PerceptionError, SimulationError
     from foretrace.geometry import invert_transform
     from foretrace.interactions import film_folder
     from foretrace.interactions.dataset import Dataset
@@ -56,8 +56,11 @@ def film(
     from foretrace.simulation.lens import WEBCAM
     from foretrace.simulation.lever_up import SimulationConfig
 
-    if out.exists() and any(out.iterdir()):
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise PerceptionError(f"{out} is in use: choose another folder")
+    for option, value, most in (("seed", seed, 2**32), ("board", board, 1000)):
+        if not 0 <= value <= most:
+            raise SimulationError(f"--{option} is {value}: give a number from 0 to {most}")
     dataset = Dataset.open(data)
     rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
     if len(rows) == 0:
@@ -96,8 +99,7 @@ def film(
 
 def _film_board(folder: Path, num: int, camera: "PinholeCamera", seed: int) -> None:
     """Pictures of the usual calibration board."""
-    import cv2
-
+    from foretrace.interactions import film_folder
     from foretrace.perception.calibration import Board
     from foretrace.simulation.film import film_board
 
@@ -105,4 +107,4 @@ def _film_board(folder: Path, num: int, camera: "PinholeCamera", seed: int) -> N
     printed = Board()
     pictures = film_board(printed.draw(4000.0), printed.size, camera, num, seed=seed)
     for number, picture in enumerate(pictures):
-        cv2.imwrite(str(folder / f"{number:02d}.png"), picture)
+        film_folder.write_picture(folder / f"{number:02d}.png", picture)

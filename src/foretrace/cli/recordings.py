@@ -152,9 +152,8 @@ class LookedAt:
 
     def save_overlay(self, path: Path, predicted: "np.ndarray", radius: "np.ndarray | None" = None) -> None:
         """Draw the outline, a path in the action frame [m] and how far off it may be [m] onto the photograph."""
-        import cv2
-
         from foretrace.geometry import transform_points
+        from foretrace.interactions.film_folder import write_picture
         from foretrace.perception.overlay import PREDICTED, draw_overlay
 
         in_table = transform_points(self.sight.T_table_action, predicted)
@@ -162,7 +161,7 @@ class LookedAt:
         paths = {"predicted": (in_table, PREDICTED)}
         radii = None if radius is None else {"predicted": radius}
         scene = self.picture, self.camera, self.T_table_camera, outline, paths
-        cv2.imwrite(str(path), draw_overlay(*scene, radii=radii))
+        write_picture(path, draw_overlay(*scene, radii=radii))
 
 
 def look_at_photo(

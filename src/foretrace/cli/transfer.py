@@ -65,7 +65,7 @@ def evaluate_transfer(
         _evaluate_recorded(predictor, recorded, out, _settings(run, predictor, "mujoco"))
         return
     for name, value in (("size", size), ("scale", scale), ("height", height)):
-        if value is not None and not value > 0:
+        if value is not None and not 0 < value < float("inf"):
             raise ShapeError(f"--{name} is {value}: give a positive length in metres")
     stand_in = StandIn()
     subjects = transfer_objects.printed_shapes() + transfer_objects.everyday_objects()

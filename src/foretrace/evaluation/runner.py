@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from foretrace.errors import ForetraceError, ResultsError
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial
+from foretrace.simulation.collect import ctrl_c_later
 
 Work = Callable[[Trial], Metrics]
 """Carries out one trial; it travels to the workers, and what it finds must depend on the trial alone."""
@@ -66,7 +67,9 @@ def run_trials(
         # One at a time: joblib would hand over short ones in batches, and hold them back until the batch is done.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs")  # pyright: ignore[reportArgumentType]
         try:
-            with closing(cast(Generator[tuple[Trial, Metrics | str]], parallel(jobs))) as finished:
+            with ctrl_c_later():
+                results = cast(Generator[tuple[Trial, Metrics | str]], parallel(jobs))
+            with closing(results) as finished:
                 for trial, found in finished:
                     if isinstance(found, str):
                         failures.append(Failure(trial, found))

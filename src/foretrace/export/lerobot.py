@@ -23,6 +23,8 @@ from foretrace.interactions.topdown import VIEW_SIZE
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
+MOST_FRAMES = 1000
+"""Frames per second that an effect may be resampled to."""
 FILE_SIZE = 100 * 2**20
 """A data file that would grow beyond this is followed by another [byte]."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -98,8 +100,8 @@ def _layout(episodes: Sequence[Episode], fps: int | None, camera: bool) -> Layou
             )
         effects.append((interaction.id, interaction.effect))
     fps = frames_per_second(effects) if fps is None else fps
-    if fps < 1:
-        raise ExportError(f"{fps} frames per second: give at least 1")
+    if not 1 <= fps <= MOST_FRAMES:
+        raise ExportError(f"{fps} frames per second: give a number from 1 to {MOST_FRAMES}")
     joints = {effect.joint_trajectory.shape[1] for _, effect in effects}
     features: Features = {
         "observation.state": _vector([f"tool_{name}" for name in POSE_NAMES]),

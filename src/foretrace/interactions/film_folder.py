@@ -7,7 +7,7 @@ nothing. ``camera.json``, ``markers.json``, ``film.json`` (unit of the depth pic
 
 import csv
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,16 @@ class FilmNotes:
             raise PerceptionError(f"{path} cannot be read ({error!r}): give depth_unit in metres") from error
 
 
+def write_picture(path: Path, picture: np.ndarray, options: Sequence[int] = ()) -> None:
+    """Write a picture, in the format that its name ends in.
+
+    Raises:
+        PerceptionError: It cannot be written there.
+    """
+    if not cv2.imwrite(str(path), picture, options):
+        raise PerceptionError(f"cannot write {path}: check the folder, its permissions and the free space")
+
+
 def write_film(folder: Path, frames: Iterable[Frame], notes: FilmNotes) -> int:
     """Write a film's frames into a folder; returns how many.
 
@@ -78,15 +88,18 @@ def write_film(folder: Path, frames: Iterable[Frame], notes: FilmNotes) -> int:
         folder: An empty or new folder.
         frames: The frames, in order.
         notes: What the film says about itself; its depth unit is that of `DEPTH_UNIT`.
+
+    Raises:
+        PerceptionError: A picture cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[tuple[str, str, str]] = []
     for number, frame in enumerate(frames):
         names = [f"colour-{number:05d}.jpg", "" if frame.depth is None else f"depth-{number:05d}.png"]
-        cv2.imwrite(str(folder / names[0]), frame.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        write_picture(folder / names[0], frame.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if frame.depth is not None:
             steps = np.clip(np.rint(frame.depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
-            cv2.imwrite(str(folder / names[1]), steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            write_picture(folder / names[1], steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         rows.append((f"{frame.time:.6f}", names[0], names[1]))
     with open(folder / TIMES, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([COLUMNS, *rows])

@@ -255,7 +255,8 @@ def read_shard(folder: Path, name: str, sha256: str | None = None) -> tuple[pa.T
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
         raise DatasetError(f"shard {path} is corrupt: its checksum is not the manifest's; {remedy}")
     try:
-        table = pq.read_table(pa.BufferReader(content))
+        # In this thread: another may let go of Python's bytes later than the interpreter can bear, when it ends.
+        table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error

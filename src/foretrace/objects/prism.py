@@ -37,6 +37,8 @@ SMALLEST_GAP = np.deg2rad(12.0)
 """Smallest angle between neighbouring sampled corners [rad]: no edge under 2.1 cm."""
 SAME_CORNER = 1e-6
 """Corners nearer than this are the same corner [m]."""
+LARGEST_COORDINATE = 1e9
+"""Corners beyond are no object of any unit [m]: their distances would overflow."""
 SMALLEST_PIECE = 1e-7
 """Convex parts below this area are left out [m^2]: collision meshes need a volume."""
 
@@ -232,6 +234,8 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     if not np.isfinite(corners).all():
         bad = int(np.flatnonzero(~np.isfinite(corners).all(axis=1))[0])
         raise ShapeError(f"corner {bad} is {corners[bad].tolist()}: every coordinate must be finite")
+    if (far := float(np.abs(corners).max())) > LARGEST_COORDINATE:
+        raise ShapeError(f"a corner lies {far:.3g} m from the origin: check unit (metres) or scale")
     same = KDTree(corners).query_pairs(SAME_CORNER)
     if same:
         first, second = min(same)

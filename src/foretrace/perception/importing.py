@@ -63,6 +63,10 @@ class ImportConfig:
     height: float | None = None
     """Height of an object of unknown shape [m]; by default that of its marker above the table."""
 
+    def __post_init__(self) -> None:
+        if self.start is not None and not np.isfinite(self.start):
+            raise PerceptionError(f"start = {self.start}: give a time stamp of the film in seconds")
+
 
 @dataclass(frozen=True)
 class Contact:

@@ -113,7 +113,7 @@ def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "rows columns 3
         rate: Pictures per second.
 
     Raises:
-        PerceptionError: The library that writes videos is not installed.
+        PerceptionError: The library that writes videos is not installed, or the file cannot be written.
     """
     try:
         import imageio_ffmpeg
@@ -129,7 +129,12 @@ def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "rows columns 3
                 fps: Any = rate  # whole numbers are asked for, fractions taken
                 writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, macro_block_size=2)
                 writer.send(None)
-            writer.send(np.ascontiguousarray(picture[..., ::-1]))
+            try:
+                writer.send(np.ascontiguousarray(picture[..., ::-1]))
+            except OSError as error:  # with all that ffmpeg had to say
+                raise PerceptionError(
+                    f"cannot write {path}: check the folder, its permissions and the free space"
+                ) from error
             count += 1
     finally:
         if writer is not None:

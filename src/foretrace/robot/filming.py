@@ -10,7 +10,7 @@ from types import TracebackType
 
 import cv2
 
-from foretrace.errors import RobotError
+from foretrace.errors import PerceptionError, RobotError
 from foretrace.interactions.film_folder import DEPTH_UNIT, NOTES, FilmNotes, Frame, write_film
 
 PATIENCE = 5.0
@@ -60,7 +60,10 @@ class Filming:
         (self._folder / NOTES).write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
 
     def _film(self) -> None:
-        write_film(self._folder, self._frames(), FilmNotes())
+        try:
+            write_film(self._folder, self._frames(), FilmNotes())
+        except PerceptionError as error:  # the motion matters more than its film
+            warnings.warn(str(error), stacklevel=2)
 
     def _frames(self) -> Iterator[Frame]:
         """Frames as they come, stamped with this machine's monotonic clock."""

@@ -13,9 +13,11 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,6 +39,8 @@ from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import NOTHING, Randomisation
 from foretrace.simulation.recipes import RECIPES
 
+MOST = 1_000_000
+"""Objects, and contacts at each edge, that a data set may have."""
 SHARD_SIZE = 100
 """Interactions in one file."""
 CHUNK_SIZE = 10
@@ -66,8 +70,8 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         for name in ("objects", "contacts_per_edge"):
-            if getattr(self, name) < 1:
-                raise SimulationError(f"{name} is {getattr(self, name)}, it must be at least 1")
+            if not 1 <= getattr(self, name) <= MOST:
+                raise SimulationError(f"{name} is {getattr(self, name)}: give a number from 1 to {MOST}")
         if self.seed < 0:
             raise SimulationError(f"seed is {self.seed}, it must not be negative")
         if self.recipe not in RECIPES:
@@ -262,9 +266,9 @@ def _simulate_shards(
     ]
     parts: dict[str, list[pa.Table]] = {name: [] for name in todo}
     with parallel_config("loky", n_jobs=max(1, min(workers, len(chunks))), inner_max_num_threads=1):
-        results = Parallel(return_as="generator_unordered")(
-            delayed(_simulate_chunk)(simulate, config, name, ids, os.getpid()) for name, ids in chunks
-        )
+        jobs = [delayed(_simulate_chunk)(simulate, config, name, ids, os.getpid()) for name, ids in chunks]
+        with ctrl_c_later():
+            results = Parallel(return_as="generator_unordered")(jobs)
         tables = cast(Iterator[tuple[str, pa.Table]], results)
         try:
             for name, table in tables:
@@ -277,6 +281,20 @@ def _simulate_shards(
                 "a worker process was killed, perhaps for want of memory; what is done is kept: "
                 f"repeat the command with fewer workers than {workers}"
             ) from error
+
+
+@contextmanager
+def ctrl_c_later() -> Iterator[None]:
+    """Ctrl-C waits while workers are started, which inherit this and so never hear it, not even as they start."""
+    if os.name != "posix":
+        yield
+        return
+    resource_tracker.ensure_running()  # which would let Ctrl-C through again, were it started later
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _first_id(table: pa.Table) -> int:

@@ -41,6 +41,18 @@ OBJECT_ID = 10
 OUT_OF_SIGHT = (0.0, 0.0, -5.0)
 FAULTS = Faults()
 """The usual ones."""
+RANGES = {
+    "width": (64, 7680),
+    "distance": (0.1, 10.0),
+    "slant": (0.0, 1.5),
+    "azimuth": (-10.0, 10.0),
+    "frames_per_second": (1.0, 100.0),
+    "lead_time": (0.0, 60.0),
+    "tail_time": (0.0, 60.0),
+    "exposures": (1, 100),
+    "depth_every": (0, 1_000_000),
+}
+"""What can be filmed. Beyond, a camera would have no room in memory, or stand under the table or within the object."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +90,12 @@ class FilmConfig:
     def __post_init__(self) -> None:
         if self.simulation.engine != "mujoco":
             raise SimulationError(f"engine {self.simulation.engine!r} cannot film: take mujoco")
-        if not 0 < self.frames_per_second <= 100 or self.exposures < 1 or self.lead_time < 0:
-            raise SimulationError(
-                f"film of {self.frames_per_second} frames per second, {self.exposures} exposures, lead of "
-                f"{self.lead_time} s: give up to 100 frames, at least 1 exposure, no negative lead"
-            )
+        given = {"width": self.camera.width}
+        given |= {name: getattr(self, name) for name in RANGES if name != "width"}
+        for name, value in given.items():
+            low, high = RANGES[name]
+            if not low <= value <= high:
+                raise SimulationError(f"film: {name} = {value}, give a number from {low:g} to {high:g}")
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ from foretrace.simulation.engine import ENGINES, Engine, Motion
 from foretrace.simulation.tool import Tool
 
 CAMERAS = ("exact", "rgbd")
+PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
+"""What is simulated: friction coefficients, densities of anything solid [kg/m^3]."""
 OFF_SAMPLES = 2
 """So many samples in a row off the blade are a slip; one alone is a bounce."""
 FALL_DEPTH = 0.5
@@ -101,6 +103,11 @@ class SimulationConfig:
                 f"rolling_friction = {self.physics.rolling_friction} m is outside 0 to 0.1 m: "
                 "it is a lever arm, a tenth of a millimetre on a hard table"
             )
+        for name, (low, high) in PHYSICS_RANGES.items():
+            if not low <= getattr(self.physics, name) <= high:
+                raise SimulationError(
+                    f"{name} = {getattr(self.physics, name)} is outside {low:g} to {high:g}: check its unit"
+                )
         make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
         if self.camera not in CAMERAS:
             raise SimulationError(f"camera {self.camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
