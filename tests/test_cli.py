@@ -276,7 +276,17 @@ def test_ctrl_c_while_a_compiled_module_is_loaded_is_no_error(monkeypatch, capsy
     assert capsys.readouterr().err == ""
 
 
-def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
+def group_lives(group: int) -> bool:
+    """Whether a process group still has members."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_keeps_what_is_done_and_says_how_to_go_on(tmp_path, sent):
     command = [
         sys.executable,
         "-m",
@@ -299,9 +309,15 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)  # what a terminal does: to the parent and its workers
+    if sent == signal.SIGINT:
+        os.killpg(process.pid, sent)  # what a terminal does: to the parent and its workers
+    else:
+        process.send_signal(sent)
     _, printed = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in printed
     assert printed.splitlines()[-1].startswith("foretrace: interrupted; what is done stays in")
     assert (tmp_path / "data" / storage.shard_name(0)).exists()
+    while group_lives(process.pid):
+        assert time.monotonic() < deadline, "workers were left behind"
+        time.sleep(0.02)

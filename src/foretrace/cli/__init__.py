@@ -6,7 +6,9 @@ signature and the help from its docstring. Whatever is slow to import is importe
 """
 
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -88,7 +90,7 @@ COMMANDS: dict[str, Command | Group] = {
 
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
+"""Exit status after Ctrl-C, and after a request of the system to end."""
 OUTPUT_CLOSED = 141
 """Exit status where whoever read the output has closed it, as `head` does: what a shell says of SIGPIPE."""
 
@@ -99,6 +101,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done. 1: `doctor` has something left to mend, or trainings of `evaluate paper` failed. 2: an error, printed as
     one line. 130: interrupted. 141: the output was closed.
     """
+    if threading.current_thread() is threading.main_thread():
+        # `kill` and batch systems are obeyed as Ctrl-C is: workers end, too, and what is done is kept.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else arguments)
