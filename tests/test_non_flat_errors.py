@@ -193,7 +193,7 @@ def test_what_does_not_look_alike_is_refused(tmp_path):
         (["--data", "{tmp}/none"], "none"),
         (["--seeds", "-1"], "seeds (-1,)"),
         (["--probes", "-1"], "--probes is -1"),
-        (["--epochs", "0"], "epochs must be at least 1"),
+        (["--epochs", "0"], "epochs is 0: give a number from 1"),
         (["--out", "{folder}/manifest.json"], "is a file"),
     ],
 )

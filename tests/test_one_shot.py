@@ -370,8 +370,10 @@ def test_other_features_are_refused():
         OneShotPredictor(make_features("im-cnn"), 24)
     with pytest.raises(TrainingError, match="unknown predictor 'one-shoot'; available: lstm, one-shot"):
         TrainConfig(predictor="one-shoot")
-    with pytest.raises(TrainingError, match="members must be at least 1, not 0"):
+    with pytest.raises(TrainingError, match="members is 0: give a number from 1"):
         OneShotConfig(members=0)
+    with pytest.raises(TrainingError, match="motions is 100000: give a number from 1 to 1024"):
+        OneShotConfig(motions=100_000)
 
 
 def test_corners_are_read_in_their_unit(batch):

@@ -284,7 +284,7 @@ def test_no_interaction_is_in_two_parts_and_novel_shapes_are_never_learned_from(
     [
         (["--seeds", "-1"], "seeds (-1,)"),
         (["--samples", "1"], "--samples is 1"),
-        (["--epochs", "0"], "epochs must be at least 1"),
+        (["--epochs", "0"], "epochs is 0: give a number from 1"),
         (["--held-out", "17"], "no object has [17] corners"),
         (["--out", "{folder}/manifest.json"], "is a file"),
     ],

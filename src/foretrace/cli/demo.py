@@ -33,6 +33,8 @@ def demo(
         workers: Processes that simulate; by default one for each core.
         seed: Seed of everything.
     """
+    from dataclasses import replace
+
     from foretrace.evaluation.animation import scene_animation
     from foretrace.evaluation.experiments import evaluate_predictor
     from foretrace.evaluation.figures import comparison_figure, contact_sheet
@@ -41,6 +43,8 @@ def demo(
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
+    # One thread: two on a core that something else uses would be many times slower.
+    config = TrainConfig(epochs=epochs, split=None, seed=seed, threads=1)
     print(f"1. Simulating lever-ups of {objects} objects with a UR10 and a screwdriver")
     counts = collect(CollectConfig(objects=objects, seed=seed), out / "data", workers)
     print("   " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
@@ -50,9 +54,7 @@ def demo(
     predictors: dict[str, EffectPredictor] = {}
     for label, name in (("none", "no feature"), ("im-cnn", "Im-CNN")):
         print(f"2. Training the LSTM with {name}")
-        # One thread: two on a core that something else uses would be many times slower.
-        config = TrainConfig(features=label, epochs=epochs, split=None, seed=seed, threads=1)
-        run = train_predictor(dataset, config, out / "runs" / label)
+        run = train_predictor(dataset, replace(config, features=label), out / "runs" / label)
         predictors[name] = load_predictor(run)
         print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
 

@@ -79,9 +79,8 @@ def train(
     from foretrace.interactions.splits import PAPER_SIZES
     from foretrace.predictor import RECIPES, train_predictor
 
-    for name, value, least in (("seed", seed, 0), ("threads", threads, 1)):
-        if value is not None and value < least:
-            raise TrainingError(f"--{name} is {value}: give a number from {least}")
+    if seed < 0:
+        raise TrainingError(f"--seed is {seed}: give a number from 0")
     if unknown := [name for name in outcomes if name not in list(Outcome)]:
         raise TrainingError(f"outcome {unknown[0]!r} is unknown: choose from {', '.join(Outcome)}")
     dataset = Dataset.open(data).where(outcome=outcomes)

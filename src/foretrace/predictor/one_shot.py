@@ -80,9 +80,9 @@ class OneShotConfig:
     """Outcomes that it tells apart; each has a future of its own."""
 
     def __post_init__(self) -> None:
-        for name in ("hidden", "layers", "members", "motions"):
-            if getattr(self, name) < 1:
-                raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name, most in (("hidden", 4096), ("layers", 32), ("members", 100), ("motions", 1024)):
+            if not 1 <= getattr(self, name) <= most:
+                raise TrainingError(f"{name} is {getattr(self, name)}: give a number from 1 to {most}")
         if self.hinges not in (1, 2):
             raise TrainingError(f"hinges must be 1 or 2, not {self.hinges}")
         for name in self.outcomes:

@@ -88,9 +88,11 @@ class TrainConfig:
     """Further settings of the one-shot predictor, by their names in `OneShotConfig`."""
 
     def __post_init__(self) -> None:
-        for name in ("steps_ahead", "hidden", "window", "epochs", "min_steps", "batch_size"):
-            if getattr(self, name) < 1:
-                raise TrainingError(f"{name} must be at least 1, not {getattr(self, name)}")
+        limits = {"hidden": 4096, "steps_ahead": 1000, "threads": 1024}
+        for name in ("steps_ahead", "hidden", "window", "epochs", "min_steps", "batch_size", "threads"):
+            value, most = getattr(self, name), limits.get(name, 1_000_000)
+            if value is not None and not 1 <= value <= most:
+                raise TrainingError(f"{name} is {value}: give a number from 1 to {most}")
         if not self.learning_rate > 0:
             raise TrainingError(f"learning_rate must be positive, not {self.learning_rate}")
         check_names(self.known)
