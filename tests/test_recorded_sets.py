@@ -8,8 +8,10 @@ import pandas as pd
 import pytest
 
 from foretrace.cli import main
+from foretrace.errors import DatasetError
 from foretrace.evaluation.transfer_recorded import levered_edge
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.recorded import NOTES_FOLDER, read_notes
 from foretrace.perception.films import open_film
 from foretrace.predictor import TrainConfig, load_predictor, train_predictor
 from foretrace.trajectories import mean_distance
@@ -113,3 +115,14 @@ def test_recordings_get_the_tables_of_the_paper(
     command[3] = str(simulated)
     assert main(command) == 2
     assert "is simulated: give a data set that" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("{", "cannot be read"), ("[]", "does not tell the recording"), ('{"recording": 3}', "the recording")],
+)
+def test_damaged_notes_are_refused(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / NOTES_FOLDER).mkdir()
+    (tmp_path / NOTES_FOLDER / "00000.json").write_text(content)
+    with pytest.raises(DatasetError, match=message):
+        read_notes(tmp_path, 0)

@@ -31,14 +31,12 @@ def overlay(
         out: The .mp4 file to write.
         topic: Image topic of a bag, if it has several.
     """
-    import json
-
     import numpy as np
 
     from foretrace.errors import DatasetError, PerceptionError
     from foretrace.evaluation.transfer_figures import side_figure
     from foretrace.interactions.dataset import Dataset
-    from foretrace.interactions.recorded import NOTES_FOLDER
+    from foretrace.interactions.recorded import read_notes
     from foretrace.perception.films import open_film
     from foretrace.perception.overlay import write_video
     from foretrace.predictor import load_predictor
@@ -47,11 +45,10 @@ def overlay(
         raise PerceptionError(f"cannot write a film to {out}: choose a name that ends in .mp4")
     dataset = Dataset.open(data)
     rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
-    notes = data / NOTES_FOLDER / f"{id:05d}.json"
-    if len(rows) == 0 or not notes.is_file():
+    said = read_notes(data, id)
+    if len(rows) == 0:
         raise DatasetError(f"{data} has no recording {id}: give a data set that `foretrace import` made")
     row = int(rows[0])
-    said = json.loads(notes.read_text(encoding="utf-8"))
     imagined = load_predictor(run).imagine_batch(dataset[row : row + 1].batch())[0]
     film = open_film(said["recording"], topic)
     times = np.array(said["frame_times"])

@@ -15,6 +15,37 @@ NOTES_FOLDER = "recordings"
 """Folder with a JSON file for each interaction: its camera, and how well it was seen."""
 
 
+NOTED = {
+    "recording": str,
+    "camera": dict,
+    "T_action_camera": list,
+    "start": (int, float),
+    "frame_times": list,
+}
+"""What those files hold at least."""
+
+
+def read_notes(folder: Path, id: int) -> dict[str, Any]:
+    """What is kept beside a recorded interaction.
+
+    Raises:
+        DatasetError: There is no such interaction, or its file is damaged.
+    """
+    path = folder / NOTES_FOLDER / f"{id:05d}.json"
+    try:
+        notes = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DatasetError(
+            f"{folder} has no recording {id}: give a data set that `foretrace import` made"
+        ) from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"{path} cannot be read ({error}): import the film again") from error
+    for name, kind in NOTED.items():
+        if not isinstance(notes, dict) or not isinstance(notes.get(name), kind):
+            raise DatasetError(f"{path} does not tell the {name}: import the film again")
+    return notes
+
+
 def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any]) -> int:
     """Adds an interaction to a data set of recordings, which is begun if there is none; returns its id.
 
