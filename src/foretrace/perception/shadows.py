@@ -32,8 +32,17 @@ SMALLEST_SHADOW = 50
 """Smaller patches of shadow are taken for noise [pixel]."""
 SMALLEST_PATCH = 400
 """Smaller patches are neither objects nor what hides one [pixel]."""
-MOST_ENCLOSED = 0.75
-"""An object casts its shadow to one side: where more than this share of its outline meets shadow, that is no shadow."""
+LEAST_LACKING, MOST_LACKING = 0.4, 0.95
+"""Up to which part of a shadow's patch may seem to lack the background's pattern, and from which on it is an object."""
+MOST_ALIKE = 0.5
+"""Of what has more of the background's colour than this, a part may be taken for shadow: its sides are darker."""
+ENCLOSING_GAP = 15
+"""A shadow encloses what it surrounds but for gaps as wide as this [pixel]: that is rather a picture on an object."""
+DOUBTFUL = (
+    "shadow and object cannot be told apart: what differs from the background has its colour, and may be a shadow or "
+    "an object of that colour; find the object by depth or with --mask grabcut, light it from all round and use --mask "
+    "threshold, or lay a sheet of another colour on the table"
+)
 
 
 @dataclass(frozen=True)
@@ -44,10 +53,6 @@ class Shadow:
     """Where shadow is seen, and nothing but the background in it."""
     light: Float[np.ndarray, "rows columns 3"]
     """Which part of the background's light reaches each pixel; below objects as beside them."""
-
-
-MOST_ALIKE = 0.3
-"""An object of which more has the background's colour may go on where shadow is seen."""
 
 
 def find_shadow(
@@ -65,19 +70,20 @@ def find_shadow(
     Raises:
         PerceptionError: What changed may be shadow or object.
     """
-    alike = _alike(now, before, changed)
-    if _largest_patch(cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))) == 0:
+    part = (now * before).sum(axis=2) / np.maximum((before**2).sum(axis=2), 1.0)
+    off = np.abs(now - part[..., None] * before).max(axis=2)
+    alike = (off < NOISE + COLOUR_CHANGE * now.max(axis=2)) & (part > LEAST_LIGHT)
+    darker = changed & alike & (part < 1.0)
+    if not _opened(darker, 3).any():
         return None
-    shaded = alike & ~_other_pattern(now.mean(axis=2), before.mean(axis=2), alike)
-    shadow = cv2.morphologyEx(shaded.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    if _largest_patch(shadow) < SMALLEST_SHADOW:
+    darker &= ~_objects(now.mean(axis=2), before.mean(axis=2), darker)
+    shadow = _opened(darker, 3)
+    if _patches(shadow)[1].max(initial=0) < SMALLEST_SHADOW:
         return None
-    things = cv2.morphologyEx((changed & ~shaded).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    contours, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    filled = cv2.drawContours(np.zeros_like(things), contours, -1, 1, cv2.FILLED)
-    shadow[filled > 0] = 0
-    _check(filled, alike, shadow)
-    hidden = _grown(filled, BORDER) & ~((shadow > 0) & ~_grown(filled, BORDER // 2))
+    things = _filled(_opened(changed & ~darker, 5))
+    shadow &= ~things
+    _check(things, alike, shadow)
+    hidden = _grown(things, BORDER) & ~(shadow & ~_grown(things, BORDER // 2))
     seen = (~hidden).astype(np.float32)
     weight = np.maximum(cv2.GaussianBlur(seen, (0, 0), 1.5), 1e-6)[..., None]
     light = cv2.GaussianBlur(seen[..., None] * (now + 1.0) / (before + 1.0), (0, 0), 1.5) / weight
@@ -87,32 +93,24 @@ def find_shadow(
     nearest: Any = labels
     values = np.zeros((int(nearest.max()) + 1, 3), dtype=light.dtype)
     values[nearest[~hidden]] = light[~hidden]
-    return Shadow(shaded, values[nearest])
+    return Shadow(darker, values[nearest])
 
 
-def _grown(mask: Any, by: int) -> Bool[np.ndarray, "rows columns"]:
-    return cv2.dilate(mask, np.ones((2 * by + 1,) * 2, np.uint8)) > 0
-
-
-def _alike(
-    now: Float[np.ndarray, "rows columns 3"],
-    before: Float[np.ndarray, "rows columns 3"],
-    changed: Bool[np.ndarray, "rows columns"],
-) -> Bool[np.ndarray, "rows columns"]:
-    """Pixels of the background's colour, but darker."""
-    part = (now * before).sum(axis=2) / np.maximum((before**2).sum(axis=2), 1.0)
-    off = np.abs(now - part[..., None] * before).max(axis=2)
-    alike = off < NOISE + COLOUR_CHANGE * now.max(axis=2)
-    return changed & alike & (part > LEAST_LIGHT) & (part < 1.0)
-
-
-def _other_pattern(
+def _objects(
     now: Float[np.ndarray, "rows columns"],
     before: Float[np.ndarray, "rows columns"],
-    shaded: Bool[np.ndarray, "rows columns"],
+    darker: Bool[np.ndarray, "rows columns"],
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Where the background has a pattern that the picture does not keep, in the smallest window that shows one."""
-    weight, other, undecided = shaded.astype(np.float32), np.zeros(shaded.shape, bool), shaded.copy()
+    """Patches of darker background that are none: nearly everywhere they lack its pattern.
+
+    Each pixel is judged by the smallest window that shows a pattern. The edge of a shadow may look like another
+    pattern, so whole patches decide.
+
+    Raises:
+        PerceptionError: A patch lacks the pattern in a part only: it may be an object with its shadow.
+    """
+    weight = darker.astype(np.float32)
+    other, undecided = np.zeros(darker.shape, bool), darker.copy()
     for size in PATTERN_WINDOWS:
         count = cv2.boxFilter(weight, -1, (size, size), normalize=False)
         now_mean, before_mean, squares, products = (
@@ -123,27 +121,58 @@ def _other_pattern(
         clear = undecided & (spread > PATTERN**2) & (count > 0.2 * size**2)
         other |= clear & (shared * before_mean < PATTERN_LEFT * spread * now_mean)
         undecided &= ~clear
-    return other
+    labels, areas = _patches(darker)
+    lacking, decided = (
+        np.bincount(labels[mask], minlength=len(areas) + 1)[1:] for mask in (other, darker & ~undecided)
+    )
+    objects = lacking > MOST_LACKING * areas
+    doubtful = ~objects & (lacking > LEAST_LACKING * areas) & (lacking > 0.5 * decided)
+    if doubtful[areas >= SMALLEST_PATCH].any():
+        raise PerceptionError(DOUBTFUL)
+    return np.concatenate([[False], objects])[labels]
 
 
-def _largest_patch(mask: Any) -> int:
-    stats = cv2.connectedComponentsWithStats(mask)[2]
-    return int(stats[1:, cv2.CC_STAT_AREA].max(initial=0))
+def _check(
+    things: Bool[np.ndarray, "rows columns"],
+    alike: Bool[np.ndarray, "rows columns"],
+    shadow: Bool[np.ndarray, "rows columns"],
+) -> None:
+    """Refuses shadows that may be objects, or parts of one.
 
-
-def _check(things: Any, alike: Bool[np.ndarray, "rows columns"], shadow: Any) -> None:
-    """Refuses shadows that may be objects."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(things)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= SMALLEST_PATCH]
-    doubtful = not large and _largest_patch(shadow) >= SMALLEST_PATCH
+    Raises:
+        PerceptionError: There is nothing else, or something within a shadow, or something of the background's colour.
+    """
+    labels, areas = _patches(things)
+    large = 1 + np.flatnonzero(areas >= SMALLEST_PATCH)
+    doubtful = len(large) == 0 and _patches(shadow)[1].max(initial=0) >= SMALLEST_PATCH
+    size = (ENCLOSING_GAP, ENCLOSING_GAP)
+    enclosed = _filled(
+        cv2.morphologyEx(shadow.astype(np.uint8), cv2.MORPH_CLOSE, np.ones(size, np.uint8)) > 0
+    )
     for k in large:
-        thing = (labels == k).astype(np.uint8)
-        ring = _grown(thing, BORDER + 2) & ~_grown(thing, BORDER)
-        doubtful |= shadow[ring].mean() > MOST_ENCLOSED
-        doubtful |= shadow[ring].any() and alike[thing > 0].mean() > MOST_ALIKE
+        thing = labels == k
+        ring = _grown(thing, 2 * BORDER) & ~thing
+        doubtful |= enclosed[thing].mean() > 0.5
+        doubtful |= shadow[ring].any() and alike[thing].mean() > MOST_ALIKE
     if doubtful:
-        raise PerceptionError(
-            "shadow and object cannot be told apart: what differs from the background has its colour, only darker, "
-            "and so may be a shadow or an object of that colour; find the object by depth or with --mask grabcut, "
-            "light it from all round and use --mask threshold, or lay a sheet of another colour on the table"
-        )
+        raise PerceptionError(DOUBTFUL)
+
+
+def _grown(mask: Bool[np.ndarray, "rows columns"], by: int) -> Bool[np.ndarray, "rows columns"]:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1,) * 2, np.uint8)) > 0
+
+
+def _opened(mask: Bool[np.ndarray, "rows columns"], size: int) -> Bool[np.ndarray, "rows columns"]:
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0
+
+
+def _filled(mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """A mask without holes."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.zeros(mask.shape, np.uint8), contours, -1, 1, cv2.FILLED) > 0
+
+
+def _patches(mask: Bool[np.ndarray, "rows columns"]) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the patches of a mask, from 1, and their areas [pixel]."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return labels, stats[1:, cv2.CC_STAT_AREA]

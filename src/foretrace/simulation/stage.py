@@ -68,9 +68,9 @@ def table_pattern(table: TableTop, rng: np.random.Generator) -> UInt8[np.ndarray
         return values / values.std()
 
     if table == "wooden":
-        grain = np.sin(4.0 * band(6, 1.5) + 2.0 * band(40, 3)) + 0.6 * band(120, 6)
+        grain = np.sin(4.0 * band(6.0, 1.5) + 2.0 * band(40.0, 3.0)) + 0.6 * band(120.0, 6.0)
         return _colours(np.array([172.0, 128.0, 84.0]), 0.08 * grain)
-    flecks = band(90, 90)
+    flecks = band(90.0, 90.0)
     return _colours(np.array([176.0, 172.0, 164.0]), 0.16 * (flecks > 1.2) - 0.3 * (flecks < -1.2))
 
 
