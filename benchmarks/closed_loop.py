@@ -3,6 +3,7 @@
 Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 10] [--data data/paper]
        [--stills 96] [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
        python benchmarks/closed_loop.py --conditions 32 --out docs/results/perception-conditions.json
+           --picture docs/images/shadows.jpg
 
 Films are made once and kept. Stills are first frames of further lever-ups: of these, views alone are compared, with the
 camera known exactly; also under conditions that films do not have by default: shadows, patterned tables, objects of the
@@ -49,7 +50,7 @@ CONDITIONS: dict[str, dict] = {
     "brown_on_wooden": {"shadows": True, "table": "wooden", "object_colour": "brown"},
     "grey_on_plain": {"shadows": True, "object_colour": "grey"},
 }
-"""What makes further stills harder than the others."""
+"""What makes stills harder than the others."""
 
 
 def subject(number: int) -> tuple[ObjectModel, LeverUp]:
@@ -86,6 +87,17 @@ def make_still(folder: Path, number: int, **condition) -> None:
         film_lever_up(*subject(number), folder, replace(config, tail_time=short), seed=number)
 
 
+def pointed_at(folder: Path, number: int) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Poses of camera and object over the table in a still, and the pixel of the contact."""
+    truth = json.loads((folder / "truth.json").read_text())
+    T_table_camera = np.array(truth["T_table_camera"])
+    T_table_object = pose_to_matrix(np.array(truth["object_poses_in_table"][:1]))[0]
+    obj, action = subject(number)
+    rim = transform_points(T_table_object, np.array([[*action.contact, obj.height]]))
+    column, row = WEBCAM.project(rim, invert_transform(T_table_camera))[0]
+    return T_table_camera, T_table_object, (float(column), float(row))
+
+
 def drawn_box(pixels: np.ndarray, margin: int = 20) -> tuple[int, int, int, int]:
     """The box that somebody draws round an object."""
     (left, top), (right, bottom) = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin
@@ -98,13 +110,8 @@ def measure_still(
     """How well the first frame of a lever-up shows the view, the camera's pose and lens being known."""
     folder, (obj, action) = root / f"{number}", subject(number)
     make_still(folder, number, **condition)
-    truth = json.loads((folder / "truth.json").read_text())
-    T_table_camera = np.array(truth["T_table_camera"])
-    T_table_object = pose_to_matrix(np.array(truth["object_poses_in_table"][:1]))[0]
-    rim = transform_points(T_table_object, np.array([[*action.contact, obj.height]]))
-    column, row = WEBCAM.project(rim, invert_transform(T_table_camera))[0]
+    T_table_camera, T_table_object, pixel = pointed_at(folder, number)
     exact, result = TopDownView.of(obj, action), {"still": number, "corners": len(obj.corners)}
-    pixel = (float(column), float(row))
     placed, T_camera_table = PlacedObject(obj, T_table_object), invert_transform(T_table_camera)
     silhouette = [WEBCAM.project(placed.outline(z), T_camera_table) for z in (0.0, obj.height)]
     for how in hows:
@@ -115,7 +122,8 @@ def measure_still(
         except PerceptionError as error:
             result |= {f"refused_{how}": str(error)}
             continue
-        turn = rotation_angle(sight.T_table_action[:3, :3], np.array(truth["T_table_action"])[:3, :3])
+        T_table_action = T_table_object @ invert_transform(action.T_action_object)
+        turn = rotation_angle(sight.T_table_action[:3, :3], T_table_action[:3, :3])
         result |= {f"iou_{how}": overlap(sight.view, exact), f"turn_{how}_deg": float(np.rad2deg(turn))}
         result[f"corners_{how}"] = len(sight.placed.object.corners)
     return result
@@ -150,6 +158,24 @@ def measure_conditions(root: Path, num: int) -> dict:
         summary[name] = {half: summarise_stills(some, hows) for half, some in halves.items()}
         print(json.dumps({name: summary[name]}, indent=1), flush=True)
     return {"summary": summary, "stills": rows}
+
+
+def picture_conditions(out: Path, root: Path) -> None:
+    """Two stills with shadows, and the outlines that were found."""
+    halves = []
+    for name, number in (("shadows", 113), ("shadows_wooden", 105)):
+        folder = root / name / f"{number}"
+        T_table_camera, _, pixel = pointed_at(folder, number)
+        sight = sight_of(folder, T_table_camera, WEBCAM, pixel, "background")
+        frame = next(open_film(folder).frames())
+        large = cv2.resize(frame.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        outline = sight.placed.outline(HEIGHT)
+        drawn = draw_overlay(large, WEBCAM.scaled(2), T_table_camera, outline, {})
+        middle = WEBCAM.scaled(2).project(outline, invert_transform(T_table_camera)).mean(axis=0)
+        left, top = np.maximum(middle.astype(int) - [400, 330], 0)
+        halves.append(drawn[top : top + 660, left : left + 800])
+    both = cv2.resize(np.hstack(halves), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(out), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def sight_of(
@@ -296,7 +322,7 @@ def main() -> None:
     parser.add_argument("--films", type=Path, default=Path("build/films"))
     parser.add_argument("--num", type=int, default=10)
     parser.add_argument("--stills", type=int, default=0)
-    parser.add_argument("--conditions", type=int, default=0, help="stills under each condition")
+    parser.add_argument("--conditions", type=int, default=0, help="stills of each kind, without --run")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--picture", type=Path)
     parser.add_argument(
@@ -306,6 +332,8 @@ def main() -> None:
     content: dict = {"versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__}}
     if options.run is None:
         content |= measure_conditions(options.films / "stills", options.conditions)
+        if options.picture is not None:
+            picture_conditions(options.picture, options.films / "stills")
     else:
         content |= measure_films(options)
     if options.out is not None:
