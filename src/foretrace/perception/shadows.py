@@ -32,8 +32,10 @@ SMALLEST_SHADOW = 50
 """Smaller patches of shadow are taken for noise [pixel]."""
 SMALLEST_PATCH = 400
 """Smaller patches are neither objects nor what hides one [pixel]."""
-LEAST_LACKING, MOST_LACKING = 0.4, 0.95
-"""Up to which part of a shadow's patch may seem to lack the background's pattern, and from which on it is an object."""
+LEAST_LACKING = 0.4
+"""A patch of which more lacks the background's pattern is doubtful."""
+MOST_LACKING = 0.9
+"""Where more of what can be judged lacks it, the patch is an object."""
 MOST_ALIKE = 0.5
 """Of what has more of the background's colour than this, a part may be taken for shadow: its sides are darker."""
 ENCLOSING_GAP = 15
@@ -103,30 +105,32 @@ def _objects(
 ) -> Bool[np.ndarray, "rows columns"]:
     """Patches of darker background that are none: nearly everywhere they lack its pattern.
 
-    Each pixel is judged by the smallest window that shows a pattern. The edge of a shadow may look like another
-    pattern, so whole patches decide.
+    Each pixel is judged by the smallest window that shows a pattern: an object is flatter there, whereas the edge of a
+    shadow is not. Yet edges may look flat by chance, so whole patches decide.
 
     Raises:
         PerceptionError: A patch lacks the pattern in a part only: it may be an object with its shadow.
     """
     weight = darker.astype(np.float32)
-    other, undecided = np.zeros(darker.shape, bool), darker.copy()
+    other, kept, undecided = np.zeros_like(darker), np.zeros_like(darker), darker.copy()
     for size in PATTERN_WINDOWS:
         count = cv2.boxFilter(weight, -1, (size, size), normalize=False)
-        now_mean, before_mean, squares, products = (
+        now_mean, before_mean, now_squares, squares, products = (
             cv2.boxFilter(weight * values, -1, (size, size), normalize=False) / np.maximum(count, 1.0)
-            for values in (now, before, before**2, now * before)
+            for values in (now, before, now**2, before**2, now * before)
         )
         spread, shared = squares - before_mean**2, products - now_mean * before_mean
         clear = undecided & (spread > PATTERN**2) & (count > 0.2 * size**2)
-        other |= clear & (shared * before_mean < PATTERN_LEFT * spread * now_mean)
+        expected = spread * (now_mean / np.maximum(before_mean, 1.0)) ** 2
+        flat = now_squares - now_mean**2 < 1.5 * expected + NOISE**2
+        keeps = shared * before_mean > PATTERN_LEFT * spread * now_mean
+        other |= clear & flat & ~keeps
+        kept |= clear & keeps
         undecided &= ~clear
     labels, areas = _patches(darker)
-    lacking, decided = (
-        np.bincount(labels[mask], minlength=len(areas) + 1)[1:] for mask in (other, darker & ~undecided)
-    )
-    objects = lacking > MOST_LACKING * areas
-    doubtful = ~objects & (lacking > LEAST_LACKING * areas) & (lacking > 0.5 * decided)
+    lacking, keeping = (np.bincount(labels[mask], minlength=len(areas) + 1)[1:] for mask in (other, kept))
+    objects = (lacking > MOST_LACKING * (lacking + keeping)) & (lacking > 0.5 * areas)
+    doubtful = ~objects & (lacking > LEAST_LACKING * areas) & (lacking > keeping)
     if doubtful[areas >= SMALLEST_PATCH].any():
         raise PerceptionError(DOUBTFUL)
     return np.concatenate([[False], objects])[labels]
