@@ -120,7 +120,7 @@ def measure_still(
                 folder, T_table_camera, WEBCAM, pixel, how, drawn_box(np.concatenate(silhouette))
             )
         except PerceptionError as error:
-            result |= {f"refused_{how}": str(error)}
+            result |= {f"refused_{how}": str(error).split(":")[0]}
             continue
         T_table_action = T_table_object @ invert_transform(action.T_action_object)
         turn = rotation_angle(sight.T_table_action[:3, :3], T_table_action[:3, :3])

@@ -84,7 +84,7 @@ def test_without_a_shadow_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("marker", [True, False])
 def test_what_may_be_shadow_or_object_is_refused(marker: bool) -> None:
     picture, background = photograph(pattern("plain"), GREY, marker=marker)
-    with pytest.raises(PerceptionError, match="by depth or with --mask grabcut"):
+    with pytest.raises(PerceptionError, match="find the object by depth"):
         masks.cover_by_background(picture, background)
 
 

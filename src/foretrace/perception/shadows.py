@@ -42,8 +42,8 @@ ENCLOSING_GAP = 15
 """A shadow encloses what it surrounds but for gaps as wide as this [pixel]: that is rather a picture on an object."""
 DOUBTFUL = (
     "shadow and object cannot be told apart: what differs from the background has its colour, and may be a shadow or "
-    "an object of that colour; find the object by depth or with --mask grabcut, light it from all round and use --mask "
-    "threshold, or lay a sheet of another colour on the table"
+    "an object of that colour; find the object by depth, lay a sheet of another colour on the table, or light it from "
+    "all round and use --mask threshold"
 )
 
 
