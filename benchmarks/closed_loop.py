@@ -2,14 +2,18 @@
 
 Usage: python benchmarks/closed_loop.py --run runs/im-cnn [--films build/films] [--num 10] [--data data/paper]
        [--stills 96] [--out docs/results/perception.json] [--picture docs/images/perception.jpg]
+       python benchmarks/closed_loop.py --conditions 32 --out docs/results/perception-conditions.json
+           --picture docs/images/shadows.jpg
 
 Films are made once and kept. Stills are first frames of further lever-ups: of these, views alone are compared, with the
-camera known exactly. Everything after that sees pictures, time stamps and the marker layout alone; the truth
+camera known exactly; also under conditions that films do not have by default: shadows, patterned tables, objects of the
+table's colour. Everything after that sees pictures, time stamps and the marker layout alone; the truth
 is opened only to compare.
 """
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -31,7 +35,7 @@ from foretrace.perception.films import open_film
 from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_film
 from foretrace.perception.markers import MarkerLayout, detect_markers
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
-from foretrace.perception.views import Sight, contact_at_pixel, place_object, see
+from foretrace.perception.views import PlacedObject, Sight, contact_at_pixel, place_object, see
 from foretrace.predictor import load_predictor
 from foretrace.simulation.film import FilmConfig, film_board, film_lever_up
 from foretrace.simulation.lens import WEBCAM
@@ -39,6 +43,14 @@ from foretrace.trajectories import mean_distance, warped_distance
 
 HEIGHT = 0.02
 BOARD = Board()
+CONDITIONS: dict[str, dict] = {
+    "shadows": {"shadows": True},
+    "shadows_wooden": {"shadows": True, "table": "wooden"},
+    "shadows_speckled": {"shadows": True, "table": "speckled"},
+    "brown_on_wooden": {"shadows": True, "table": "wooden", "object_colour": "brown"},
+    "grey_on_plain": {"shadows": True, "object_colour": "grey"},
+}
+"""What makes stills harder than the others."""
 
 
 def subject(number: int) -> tuple[ObjectModel, LeverUp]:
@@ -67,39 +79,103 @@ def make_films(root: Path, num: int) -> None:
             print(f"filmed {folder}", flush=True)
 
 
-def measure_still(root: Path, number: int) -> dict:
-    """How well the first frame of a lever-up shows the view, the camera's pose and lens being known."""
-    folder, (obj, action), config = root / f"{number}", subject(number), film_config(number)
+def make_still(folder: Path, number: int, **condition) -> None:
+    """One frame, before the blade moves."""
     if not (folder / "truth.json").is_file():
-        # One frame, before the blade moves.
+        config = replace(film_config(number), depth_every=1, **condition)
         short = 1.5 / config.frames_per_second - config.lead_time - config.simulation.path.duration
-        film_lever_up(obj, action, folder, replace(config, tail_time=short, depth_every=1), seed=number)
+        film_lever_up(*subject(number), folder, replace(config, tail_time=short), seed=number)
+
+
+def pointed_at(folder: Path, number: int) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Poses of camera and object over the table in a still, and the pixel of the contact."""
     truth = json.loads((folder / "truth.json").read_text())
     T_table_camera = np.array(truth["T_table_camera"])
     T_table_object = pose_to_matrix(np.array(truth["object_poses_in_table"][:1]))[0]
+    obj, action = subject(number)
     rim = transform_points(T_table_object, np.array([[*action.contact, obj.height]]))
     column, row = WEBCAM.project(rim, invert_transform(T_table_camera))[0]
+    return T_table_camera, T_table_object, (float(column), float(row))
+
+
+def drawn_box(pixels: np.ndarray, margin: int = 20) -> tuple[int, int, int, int]:
+    """The box that somebody draws round an object."""
+    (left, top), (right, bottom) = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin
+    return int(left), int(top), int(right - left), int(bottom - top)
+
+
+def measure_still(
+    root: Path, number: int, hows: Sequence[str] = ("background", "depth"), **condition
+) -> dict:
+    """How well the first frame of a lever-up shows the view, the camera's pose and lens being known."""
+    folder, (obj, action) = root / f"{number}", subject(number)
+    make_still(folder, number, **condition)
+    T_table_camera, T_table_object, pixel = pointed_at(folder, number)
     exact, result = TopDownView.of(obj, action), {"still": number, "corners": len(obj.corners)}
-    for how in ("background", "depth"):
-        sight = sight_of(folder, T_table_camera, WEBCAM, (float(column), float(row)), how)
-        turn = rotation_angle(sight.T_table_action[:3, :3], np.array(truth["T_table_action"])[:3, :3])
+    placed, T_camera_table = PlacedObject(obj, T_table_object), invert_transform(T_table_camera)
+    silhouette = [WEBCAM.project(placed.outline(z), T_camera_table) for z in (0.0, obj.height)]
+    for how in hows:
+        try:
+            sight = sight_of(
+                folder, T_table_camera, WEBCAM, pixel, how, drawn_box(np.concatenate(silhouette))
+            )
+        except PerceptionError as error:
+            result |= {f"refused_{how}": str(error).split(":")[0]}
+            continue
+        T_table_action = T_table_object @ invert_transform(action.T_action_object)
+        turn = rotation_angle(sight.T_table_action[:3, :3], T_table_action[:3, :3])
         result |= {f"iou_{how}": overlap(sight.view, exact), f"turn_{how}_deg": float(np.rad2deg(turn))}
         result[f"corners_{how}"] = len(sight.placed.object.corners)
     return result
 
 
-def summarise_stills(stills: list[dict]) -> dict:
+def summarise_stills(stills: list[dict], hows: Sequence[str] = ("background", "depth")) -> dict:
     summary: dict = {"count": len(stills)}
-    for how in ("background", "depth"):
-        overlaps = np.array([still[f"iou_{how}"] for still in stills])
+    for how in hows:
+        seen = [still for still in stills if f"iou_{how}" in still]
+        if len(seen) < len(stills):
+            summary[f"refused_{how}"] = len(stills) - len(seen)
+        if not seen:
+            continue
+        overlaps = np.array([still[f"iou_{how}"] for still in seen])
         summary |= {
             f"iou_{how}_median": float(np.median(overlaps)),
             f"iou_{how}_min": float(overlaps.min()),
             f"iou_{how}_below_0.98": int((overlaps < 0.98).sum()),
-            f"turn_{how}_max_deg": max(still[f"turn_{how}_deg"] for still in stills),
-            f"corners_right_{how}": sum(still["corners"] == still[f"corners_{how}"] for still in stills),
+            f"turn_{how}_max_deg": max(still[f"turn_{how}_deg"] for still in seen),
+            f"corners_right_{how}": sum(still["corners"] == still[f"corners_{how}"] for still in seen),
         }
     return summary
+
+
+def measure_conditions(root: Path, num: int) -> dict:
+    """Stills under each condition: the first half was looked at while shadows were learned to tell, the second not."""
+    rows, summary = {}, {}
+    for name, condition in CONDITIONS.items():
+        hows = ["background", "depth"] + ["grabcut"] * ("object_colour" in condition)
+        rows[name] = [measure_still(root / name, 100 + k, hows, **condition) for k in range(num)]
+        halves = {"looked_at": rows[name][: num // 2], "fair": rows[name][num // 2 :]}
+        summary[name] = {half: summarise_stills(some, hows) for half, some in halves.items()}
+        print(json.dumps({name: summary[name]}, indent=1), flush=True)
+    return {"summary": summary, "stills": rows}
+
+
+def picture_conditions(out: Path, root: Path) -> None:
+    """Two stills with shadows, and the outlines that were found."""
+    halves = []
+    for name, number in (("shadows", 113), ("shadows_wooden", 105)):
+        folder = root / name / f"{number}"
+        T_table_camera, _, pixel = pointed_at(folder, number)
+        sight = sight_of(folder, T_table_camera, WEBCAM, pixel, "background")
+        frame = next(open_film(folder).frames())
+        large = cv2.resize(frame.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        outline = sight.placed.outline(HEIGHT)
+        drawn = draw_overlay(large, WEBCAM.scaled(2), T_table_camera, outline, {})
+        middle = WEBCAM.scaled(2).project(outline, invert_transform(T_table_camera)).mean(axis=0)
+        left, top = np.maximum(middle.astype(int) - [400, 330], 0)
+        halves.append(drawn[top : top + 660, left : left + 800])
+    both = cv2.resize(np.hstack(halves), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(out), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def sight_of(
@@ -108,6 +184,7 @@ def sight_of(
     camera: PinholeCamera,
     pixel: tuple[float, float],
     how: str,
+    box: tuple[int, int, int, int] | None = None,
 ) -> Sight:
     """What the first frame alone shows of an object of unknown shape."""
     frame = next(open_film(folder).frames())
@@ -116,6 +193,10 @@ def sight_of(
         heights = masks.heights_above_table(frame.depth, camera, T_table_camera)
         mask = masks.pick_object(masks.mask_by_height(heights), pixel)
         height, rim = masks.object_height(heights, mask), 0.008
+    elif how == "grabcut":
+        assert box is not None
+        mask = masks.pick_object(masks.mask_by_grabcut(frame.picture, box), pixel)
+        height, rim = HEIGHT, 0.003
     else:
         background = read_picture(folder / "background.png")
         cover = masks.cover_by_background(frame.picture, background)
@@ -237,16 +318,30 @@ def judge_simulated(data: Path) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--run", type=Path, help="without it only stills under conditions are measured")
     parser.add_argument("--films", type=Path, default=Path("build/films"))
     parser.add_argument("--num", type=int, default=10)
     parser.add_argument("--stills", type=int, default=0)
+    parser.add_argument("--conditions", type=int, default=0, help="stills of each kind, without --run")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--picture", type=Path)
     parser.add_argument(
         "--data", type=Path, help="simulated data set on which judging from motion is checked"
     )
     options = parser.parse_args()
+    content: dict = {"versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__}}
+    if options.run is None:
+        content |= measure_conditions(options.films / "stills", options.conditions)
+        if options.picture is not None:
+            picture_conditions(options.picture, options.films / "stills")
+    else:
+        content |= measure_films(options)
+    if options.out is not None:
+        options.out.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def measure_films(options: argparse.Namespace) -> dict:
+    """Films and stills as they are by default, and what a predictor makes of them."""
     make_films(options.films, options.num)
     calibration = calibrate(read_pictures([options.films / "board"]), BOARD)
     predictor = load_predictor(options.run)
@@ -290,19 +385,14 @@ def main() -> None:
     stills = [measure_still(options.films / "stills", 100 + k) for k in range(options.stills)]
     summary["stills"] = summarise_stills(stills) if stills else None
     print(json.dumps({"summary": summary, "judging": judged}, indent=1))
-    if options.out is not None:
-        content = {
-            "versions": {"foretrace": version("foretrace"), "opencv": cv2.__version__},
-            "run": str(options.run),
-        }
-        content |= {
-            "summary": summary,
-            "judging": judged,
-            "films": rows,
-            "stills": stills,
-            "refused": refused,
-        }
-        options.out.write_text(json.dumps(content, indent=1) + "\n")
+    return {
+        "run": str(options.run),
+        "summary": summary,
+        "judging": judged,
+        "films": rows,
+        "stills": stills,
+        "refused": refused,
+    }
 
 
 if __name__ == "__main__":

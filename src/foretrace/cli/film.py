@@ -23,6 +23,9 @@ def film(
     depth_every: int = 10,
     embodiment: Literal["tool", "arm"] | None = None,
     board: int = 0,
+    shadows: bool = False,
+    table: Literal["plain", "wooden", "speckled"] = "plain",
+    object_colour: Literal["blue", "grey", "brown"] = "blue",
     seed: int = 0,
 ) -> None:
     """Film a lever-up of a data set, simulated anew, as a camera above a real table would: a folder for `import`.
@@ -42,7 +45,10 @@ def film(
         depth_every: Keep depth with every so many pictures; 0: never.
         embodiment: What moves the blade: nothing that is seen, or the whole arm; by default as in the data set.
         board: Film so many pictures of a calibration board, too, and leave the camera's file to `calibrate`.
-        seed: Seed of noise, clock, and of where the marker sits.
+        shadows: Let a slanted lamp of some size cast soft shadows.
+        table: How the table looks.
+        object_colour: The object's colour; grey resembles the plain table, brown the wooden one.
+        seed: Seed of noise, clock, table, and of where marker and lamp are.
     """
     import json
 
@@ -73,7 +79,18 @@ def film(
     simulation = SimulationConfig(
         embodiment=embodiment or recorded.get("embodiment", "tool"), physics=shown.physics
     )
-    config = FilmConfig(camera, distance, slant, azimuth, fps, depth_every=depth_every, simulation=simulation)
+    config = FilmConfig(
+        camera,
+        distance,
+        slant,
+        azimuth,
+        fps,
+        depth_every=depth_every,
+        shadows=shadows,
+        table=table,
+        object_colour=object_colour,
+        simulation=simulation,
+    )
     obj, action = shown.object, shown.action
     if board:
         _film_board(out / "board", board, camera, seed)

@@ -11,6 +11,7 @@ from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import MINIMAL_HEIGHT
+from foretrace.perception.shadows import Shadow, find_shadow
 
 LEAST_CHANGE = 14.0
 """A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
@@ -50,10 +51,11 @@ def cover_by_background(
 ) -> Float[np.ndarray, "rows columns"]:
     """Which part of each pixel something covers that a picture of the same place without the object does not show.
 
-    A change of the light as a whole is taken out first: the one gain for each colour that most pixels agree on.
+    A change of the light as a whole is taken out first: the one gain for each colour that most pixels agree on; then
+    shadows, which darken the background and keep its colour and pattern.
 
     Raises:
-        PerceptionError: The pictures differ in size or in nearly everything.
+        PerceptionError: The pictures differ in size or in nearly everything, or what differs may be object or shadow.
     """
     if picture.shape != background.shape:
         raise PerceptionError(
@@ -69,28 +71,42 @@ def cover_by_background(
             f"{100 * mask.mean():.0f} % of the picture differ from the background: was the camera moved or the light "
             "switched? take both anew"
         )
-    return np.where(mask, np.clip(_coverage(now, before, mask), 0.0, 1.0), 0.0)
+    shadow = find_shadow(now, before, mask)
+    if shadow is not None:
+        before = shadow.light * before
+        mask = np.abs(now - before).max(axis=2) > least_change
+    return np.where(mask, np.clip(_coverage(now, before, mask, shadow), 0.0, 1.0), 0.0)
 
 
 def _coverage(
     now: Float[np.ndarray, "rows columns 3"],
     before: Float[np.ndarray, "rows columns 3"],
     mask: Bool[np.ndarray, "rows columns"],
+    shadow: Shadow | None,
 ) -> Float[np.ndarray, "rows columns"]:
     """Which part of each pixel something new covers: blur mixes its colour with that of the background behind it.
 
     Its colour is that of the nearest pixel well inside the mask; 1 where none is close, or where the two look alike.
+    Where there are shadows, only what makes the colours differ other than in brightness counts, if that is much.
     """
     size = 2 * EDGE_DEPTH + 1
-    inside = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    inside = mask if shadow is None else mask & ~shadow.pixels
+    inside = cv2.erode(inside.astype(np.uint8), np.ones((size, size), np.uint8))
     away, labels = cv2.distanceTransformWithLabels(1 - inside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     nearest: Any = labels
     rows, columns = np.nonzero(mask & (inside == 0) & (away <= 2 * size))
     colours = np.zeros((int(nearest.max()) + 1, 3), dtype=now.dtype)
     colours[nearest[inside > 0]] = now[inside > 0]
-    apart = colours[nearest[rows, columns]] - before[rows, columns]
+    behind = before[rows, columns]
+    apart = colours[nearest[rows, columns]] - behind
+    change = now[rows, columns] - behind
+    if shadow is not None:
+        hue = behind / np.maximum(np.linalg.norm(behind, axis=1, keepdims=True), 1e-9)
+        across, changed = (v - (v * hue).sum(axis=1, keepdims=True) * hue for v in (apart, change))
+        distinct = (across**2).sum(axis=1, keepdims=True) > (2 * LEAST_CHANGE) ** 2
+        apart, change = np.where(distinct, across, apart), np.where(distinct, changed, change)
     length = (apart**2).sum(axis=1)
-    mixed = ((now[rows, columns] - before[rows, columns]) * apart).sum(axis=1)
+    mixed = (change * apart).sum(axis=1)
     coverage = np.ones(mask.shape)
     coverage[rows, columns] = np.where(length > LEAST_CHANGE**2, mixed / np.maximum(length, 1e-9), 1.0)
     return coverage

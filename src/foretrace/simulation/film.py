@@ -27,6 +27,7 @@ from foretrace.simulation.engine import Motion
 from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_picture, spoil, spoil_depth
 from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
 from foretrace.simulation.scene import body_origin, build_scene
+from foretrace.simulation.stage import ObjectColour, TableTop, cast_shadows, set_stage
 
 DICTIONARY = "apriltag_36h11"
 MODULES = 8
@@ -80,6 +81,12 @@ class FilmConfig:
     """Depth is filmed with every so many colour frames; 0: never."""
     faults: Faults = field(default_factory=Faults)
     """What spoils the pictures."""
+    shadows: bool = False
+    """A slanted lamp of some size casts soft shadows."""
+    table: TableTop = "plain"
+    """How the table looks."""
+    object_colour: ObjectColour = "blue"
+    """The object's colour; grey resembles the plain table, brown the wooden one."""
     table_side: float = 0.05
     """Side of the table's markers [m]."""
     largest_side: float = 0.045
@@ -143,7 +150,7 @@ def film_lever_up(
         action: The lever-up.
         folder: An empty or new folder.
         config: How it is filmed.
-        seed: Seed of the noise, of where the marker sits on the object, and of the clock.
+        seed: Seed of the noise, of where marker and lamp are, of the clock, and of the table's pattern.
 
     Raises:
         SimulationError: The machine cannot render.
@@ -159,12 +166,14 @@ def film_lever_up(
     spec = build_scene(obj, simulation.physics, simulation.tool, simulation.embodiment, simulation.timestep)
     T_action_table = _add_markers(spec, obj, T_object_marker, side, config, rng)
     T_table_action = invert_transform(T_action_table)
+    set_stage(spec, config.table, config.object_colour, np.random.default_rng([seed, 1]))
+    lamp = cast_shadows(spec, np.random.default_rng([seed, 2])) if config.shadows else None
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
     duration = config.lead_time + simulation.path.duration + config.tail_time
     count = round(duration * config.frames_per_second)
     times = action_start - config.lead_time + np.arange(count) / config.frames_per_second
     poses = _interpolate(motion, times - action_start)[0]
-    with LensCamera(spec, config.camera, T_action_camera) as lens:
+    with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(folder / film_folder.BACKGROUND), _background(lens, obj, motion, config, rng))
         frames = _frames(lens, obj, motion, times, action_start, config, rng)

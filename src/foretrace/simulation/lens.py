@@ -45,12 +45,20 @@ class LensCamera:
         spec: The scene; a camera is added to it.
         camera: The camera.
         T_world_camera: Its pose (x right, y down, z forward).
+        lamp: Points that the scene's first light shines from [m]: it casts the shadows of all, blended. Without any
+            nothing casts a shadow.
 
     Raises:
         SimulationError: The machine cannot render.
     """
 
-    def __init__(self, spec: mujoco.MjSpec, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
+    def __init__(
+        self,
+        spec: mujoco.MjSpec,
+        camera: PinholeCamera,
+        T_world_camera: Float[np.ndarray, "4 4"],
+        lamp: Float[np.ndarray, "point 3"] | None = None,
+    ):
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=-1).astype(float))
         reach = camera.fy * np.abs(rays[:, :2]).max(axis=0)
@@ -61,7 +69,7 @@ class LensCamera:
         # MuJoCo's camera has y up and looks along -z.
         turned = matrix_to_quaternion(T_world_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
         spec.worldbody.add_camera(name="film", pos=T_world_camera[:3, 3], quat=turned)
-        self.camera, self.model = camera, spec.compile()
+        self.camera, self.model, self._lamp = camera, spec.compile(), lamp
         """Intrinsics, and the compiled scene."""
         self.model.cam_fovy[self.model.camera("film").id] = np.rad2deg(2 * np.arctan(height / 2 / camera.fy))
         self.data = mujoco.MjData(self.model)
@@ -76,9 +84,17 @@ class LensCamera:
 
     def colours(self) -> Float[np.ndarray, "rows columns 3"]:
         """The scene as it is: blue, green, red, bent by the lens and without noise."""
-        self._update()
-        rgb = self._renderer.render()
-        return self._bend(rgb[..., ::-1].astype(np.float32), cv2.INTER_LINEAR)
+        if self._lamp is None:
+            self._update()
+            rgb = self._renderer.render().astype(np.float32)
+        else:
+            rgb = np.mean([self._lit_from(point) for point in self._lamp], axis=0)
+        return self._bend(rgb[..., ::-1], cv2.INTER_LINEAR)
+
+    def _lit_from(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows columns 3"]:
+        self.model.light_pos[0] = point
+        self._update(shadows=True)
+        return self._renderer.render().astype(np.float32)
 
     def depths(self) -> Float[np.ndarray, "rows columns"]:
         """Distance along the optical axis [m], without noise."""
@@ -88,11 +104,11 @@ class LensCamera:
         self._renderer.disable_depth_rendering()
         return self._bend(depth, cv2.INTER_NEAREST).astype(float)
 
-    def _update(self) -> None:
+    def _update(self, shadows: bool = False) -> None:
         mujoco.mj_forward(self.model, self.data)
         self._renderer.update_scene(self.data, camera="film")
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-            self._renderer.scene.flags[flag] = 0
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
 
     def _bend(self, picture: np.ndarray, interpolation: int) -> Any:
         return cv2.remap(picture, self._maps[0], self._maps[1], interpolation)
