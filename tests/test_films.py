@@ -247,6 +247,16 @@ def test_a_photograph_of_an_object_without_height_is_refused(film: tuple[Path, F
         look_at(0.0)
 
 
+def test_depth_helps_where_the_background_does_not_tell(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
+    folder = shutil.copytree(film[0], tmp_path / "film")
+    cv2.imwrite(str(folder / "background.png"), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    layout, contact = MarkerLayout.load(folder / "markers.json"), Contact(edge=(2, 0.5))
+    with pytest.warns(UserWarning, match="found by depth, since by background: .* of the picture differ"):
+        found = import_film(open_film(folder), CAMERA, layout, contact, PRISM)
+    off = found.T_table_object[0, :3, 3] - film[1].T_table_object[0, :3, 3]
+    assert np.linalg.norm(off) < 0.003
+
+
 def test_an_action_is_said_once() -> None:
     with pytest.raises(PerceptionError, match="exactly one"):
         Contact()

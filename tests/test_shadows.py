@@ -88,6 +88,14 @@ def test_what_may_be_shadow_or_object_is_refused(marker: bool) -> None:
         masks.cover_by_background(picture, background)
 
 
+def test_who_has_no_shadows_says_so() -> None:
+    picture, background = photograph(pattern("plain"), GREY, np.zeros_like(SHADOW))
+    with pytest.raises(PerceptionError, match="say --no-shadows"):
+        masks.cover_by_background(picture, background)
+    found = masks.pick_object(masks.cover_by_background(picture, background, shadows=False) > 0.5)
+    assert iou(found, THING[..., 0] > 0.5) > 0.99
+
+
 def test_white_objects_are_refused_with_shadows_alone() -> None:
     """Their sides may be as dark as a shadow."""
     table = 0.7 * pattern("plain")

@@ -133,6 +133,7 @@ def predict(
     contact_px: tuple[float, float] | None = None,
     mask: MaskMethod = "grabcut",
     background: Path | None = None,
+    shadows: bool = True,
     box: tuple[int, int, int, int] | None = None,
     hull: bool = False,
     friction: float | None = None,
@@ -168,6 +169,7 @@ def predict(
         contact_px: Column and row in the photograph of the point to lever at, on the object's upper rim.
         mask: How the object is found in the photograph.
         background: Photograph of the table without the object, for --mask background.
+        shadows: Whether the object may cast shadows, which --mask background then tells from it.
         box: Left, top, width and height of a box round the object, for --mask grabcut.
         hull: Take the convex hull of the outline in the photograph, as the paper does.
         friction: Friction coefficient between object and table, for a predictor that knows it and for --compare.
@@ -198,7 +200,7 @@ def predict(
             raise PredictionError(
                 "--photo shows the object: leave out the other ways, and --edge and --contact"
             )
-        seen = look_at_photo(photo, camera, markers, height, contact_px, mask, background, box, hull)
+        seen = look_at_photo(photo, camera, markers, height, contact_px, mask, background, box, hull, shadows)
         obj, action, view, com = (
             seen.sight.placed.object,
             seen.sight.action,
@@ -207,7 +209,12 @@ def predict(
         )
     else:
         of_photo = {"camera": camera, "markers": markers, "contact-px": contact_px}
-        of_photo |= {"background": background, "box": box, "hull": hull or None}
+        of_photo |= {
+            "background": background,
+            "no-shadows": not shadows or None,
+            "box": box,
+            "hull": hull or None,
+        }
         if idle := [f"--{option}" for option, value in of_photo.items() if value is not None]:
             raise PredictionError(f"{', '.join(idle)} goes with --photo: give one, or leave it out")
         obj, action, view, com = _object_and_action(

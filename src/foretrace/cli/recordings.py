@@ -32,6 +32,7 @@ def import_recording(
     fraction: float = 0.5,
     start: float | None = None,
     max_gap: float = 0.25,
+    shadows: bool = True,
     topic: str | None = None,
     depth_topic: str | None = None,
 ) -> None:
@@ -55,6 +56,8 @@ def import_recording(
         fraction: How far along that edge.
         start: Time stamp at which the blade's path starts [s]; by default told from when the object moves.
         max_gap: The longest time without markers that is bridged [s].
+        shadows: Whether the object may cast shadows, which are then told from it; else all that differs from the
+            background is the object.
         topic: Image topic of a bag, if it has several.
         depth_topic: Depth topic of a bag, aligned with the images; by default the one in the same frame, if any.
     """
@@ -76,7 +79,7 @@ def import_recording(
     if layout is None:
         raise PerceptionError(f"{recording} has no {MARKERS} beside it: give --markers")
     where = Contact(contact, contact_px, None if edge is None else (edge, fraction))
-    config = ImportConfig(track=TrackConfig(largest_gap=max_gap), start=start, height=height)
+    config = ImportConfig(track=TrackConfig(largest_gap=max_gap), start=start, height=height, shadows=shadows)
     shape = None if object is None else read_shape(object, height)
     found = import_film(film, seen_by, MarkerLayout.load(layout), where, shape, config)
     id = add_recorded(out, found.interaction, _notes(recording, seen_by, found))
@@ -174,6 +177,7 @@ def look_at_photo(
     background: Path | None,
     box: tuple[int, int, int, int] | None,
     hull: bool,
+    shadows: bool = True,
 ) -> LookedAt:
     """What a predictor needs to know of a photograph.
 
@@ -187,6 +191,7 @@ def look_at_photo(
         background: Picture of the table without the object, for ``background``.
         box: Left, top, width and height of a box round the object, for ``grabcut``.
         hull: Take the convex hull of the outline (paper, section 5.4).
+        shadows: Whether there may be shadows, for ``background``.
 
     Raises:
         PerceptionError: The photograph does not tell it.
@@ -215,7 +220,7 @@ def look_at_photo(
             raise PerceptionError(
                 "--mask background needs --background, a picture of the table without the object"
             )
-        cover = masks.cover_by_background(picture, read_picture(background))
+        cover = masks.cover_by_background(picture, read_picture(background), shadows=shadows)
         found = cover > 0.5
     elif mask == "grabcut":
         if box is None:

@@ -1,5 +1,6 @@
 """From a film to an interaction: the object on the table, its path, the view of it, and what became of it."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -62,6 +63,8 @@ class ImportConfig:
     """Time stamp at which the blade's path starts [s]; by default the film's note, else from the object's motion."""
     height: float | None = None
     """Height of an object of unknown shape [m]; by default that of its marker above the table."""
+    shadows: bool = True
+    """Whether there may be shadows, which are then told from the object."""
 
     def __post_init__(self) -> None:
         if self.start is not None and not np.isfinite(self.start):
@@ -265,7 +268,8 @@ def _place(
             f"{1e3 * height:.0f} mm high: check the sides of the markers, the height and the camera file"
         )
     middle = camera.project(T_table_body[None, :3, 3], invert_transform(T_table_camera))[0]
-    mask, rim = find_mask(first[0], film, camera, T_table_camera, (float(middle[0]), float(middle[1])))
+    point = float(middle[0]), float(middle[1])
+    mask, rim = find_mask(first[0], film, camera, T_table_camera, point, config.shadows)
     seen = place_object(mask, camera, T_table_camera, height, min(rim, 0.5 * height))
     return seen if shape is None else fit_object(seen, shape)
 
@@ -276,18 +280,24 @@ def find_mask(
     camera: PinholeCamera,
     T_table_camera: Float[np.ndarray, "4 4"],
     point: tuple[float, float],
+    shadows: bool = True,
 ) -> tuple[Bool[np.ndarray, "rows columns"] | Float[np.ndarray, "rows columns"], float]:
     """The object in the first frame by the film's background or its depth, and where above the table it begins [m].
 
-    By the background: which part of each pixel it covers.
+    By the background: which part of each pixel it covers. By depth where the background does not tell.
 
     Raises:
-        PerceptionError: The film has neither.
+        PerceptionError: The film has neither, or what it has does not tell.
     """
     background = film.background()
     if background is not None:
-        cover = cover_by_background(frame.picture, background)
-        return cover_of(cover, pick_object(cover > 0.5, point)), BEVEL.height
+        try:
+            cover = cover_by_background(frame.picture, background, shadows=shadows)
+            return cover_of(cover, pick_object(cover > 0.5, point)), BEVEL.height
+        except PerceptionError as error:
+            if frame.depth is None:
+                raise
+            warnings.warn(f"the object is found by depth, since by background: {error}", stacklevel=2)
     if frame.depth is not None:
         heights = heights_above_table(frame.depth, camera, T_table_camera)
         return pick_object(mask_by_height(heights), point), 2 * MINIMAL_HEIGHT

@@ -48,11 +48,18 @@ def cover_by_background(
     picture: UInt8[np.ndarray, "rows columns 3"],
     background: UInt8[np.ndarray, "other_rows other_columns 3"],
     least_change: float = LEAST_CHANGE,
+    shadows: bool = True,
 ) -> Float[np.ndarray, "rows columns"]:
     """Which part of each pixel something covers that a picture of the same place without the object does not show.
 
     A change of the light as a whole is taken out first: the one gain for each colour that most pixels agree on; then
     shadows, which darken the background and keep its colour and pattern.
+
+    Args:
+        picture: The picture.
+        background: The same place before.
+        least_change: By how much a colour must differ [of 255].
+        shadows: Whether there may be shadows; without any, whatever differs is an object, of the table's colour, too.
 
     Raises:
         PerceptionError: The pictures differ in size or in nearly everything, or what differs may be object or shadow.
@@ -71,7 +78,7 @@ def cover_by_background(
             f"{100 * mask.mean():.0f} % of the picture differ from the background: was the camera moved or the light "
             "switched? take both anew"
         )
-    shadow = find_shadow(now, before, mask)
+    shadow = find_shadow(now, before, mask) if shadows else None
     if shadow is not None:
         before = shadow.light * before
         mask = np.abs(now - before).max(axis=2) > least_change

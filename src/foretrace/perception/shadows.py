@@ -43,7 +43,7 @@ ENCLOSING_GAP = 15
 DOUBTFUL = (
     "shadow and object cannot be told apart: what differs from the background has its colour, and may be a shadow or "
     "an object of that colour; find the object by depth, lay a sheet of another colour on the table, or light it from "
-    "all round and use --mask threshold"
+    "all round and say --no-shadows"
 )
 
 

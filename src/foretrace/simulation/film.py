@@ -49,7 +49,7 @@ RANGES = {
     "azimuth": (-10.0, 10.0),
     "frames_per_second": (1.0, 100.0),
     "lead_time": (0.0, 60.0),
-    "tail_time": (0.0, 60.0),
+    "tail_time": (-60.0, 60.0),
     "exposures": (1, 100),
     "depth_every": (0, 1_000_000),
 }
@@ -74,7 +74,7 @@ class FilmConfig:
     lead_time: float = 0.4
     """Time filmed before the blade's path starts [s]."""
     tail_time: float = 0.1
-    """Time filmed after its end [s]."""
+    """Time filmed after its end [s]; below 0, the film ends before."""
     exposures: int = 2
     """Moments within a hundredth of a second that are blended into one frame: motion blur."""
     depth_every: int = 1
@@ -170,7 +170,7 @@ def film_lever_up(
     lamp = cast_shadows(spec, np.random.default_rng([seed, 2])) if config.shadows else None
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
     duration = config.lead_time + simulation.path.duration + config.tail_time
-    count = round(duration * config.frames_per_second)
+    count = max(1, round(duration * config.frames_per_second))
     times = action_start - config.lead_time + np.arange(count) / config.frames_per_second
     poses = _interpolate(motion, times - action_start)[0]
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
