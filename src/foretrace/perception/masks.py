@@ -170,6 +170,8 @@ def mask_by_grabcut(
         raise PerceptionError(
             f"box {box} in a picture of {columns} x {rows} pixels: give left, top, width and height within it"
         )
+    if width * height == rows * columns:
+        raise PerceptionError(f"box {box} is the whole picture: leave some of the table beside it")
     labels = np.zeros((rows, columns), dtype=np.uint8)
     models = [np.zeros((1, 65)) for _ in range(2)]
     cv2.setRNGSeed(0)
