@@ -84,7 +84,7 @@ def test_the_retreat_sets_down_pulls_out_and_goes_up(kinematics, legs):
     set_down, retreat = plan_retreat(legs)
     assert (set_down.name, retreat.name) == ("set-down", "retreat")
     for before, leg in pairwise([legs[1], set_down, retreat]):
-        np.testing.assert_array_equal(before.joints[-1], leg.joints[0])
+        np.testing.assert_allclose(before.joints[-1], leg.joints[0], atol=1e-12)
     T_action_base = ACTION.T_action_object @ T_TABLE_BASE
     tips = [
         np.array([T_action_base @ posture.T_base_tip for posture in kinematics.along(leg.joints)])[:, :3, 3]
