@@ -78,7 +78,7 @@ def test_recordings_are_learned_from_and_judged_like_simulations(
     assert (tmp_path / "overlay-side.png").stat().st_size > 1000
     changed = np.abs(shown[-1].picture.astype(int) - film[-1].picture).max(axis=2) > 80
     assert 100 < changed.sum() < 0.1 * changed.size
-    assert main(["overlay", str(recorded), "9", "--run", str(tmp_path / "run"), "--out", str(video)]) == 2
+    assert main(["overlay", str(recorded), "9", "--out", str(video)]) == 2
     assert "has no recording 9" in capsys.readouterr().err
     assert main(["show", str(recorded), "--out", str(tmp_path / "all.png")]) == 0
     assert (tmp_path / "all.png").stat().st_size > 1000

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def overlay(
-    data: Positional[Path], id: Positional[int], run: Path, out: Path, topic: str | None = None
+    data: Positional[Path], id: Positional[int], out: Path, run: Path | None = None, topic: str | None = None
 ) -> None:
     """Draw what a predictor expects and what was observed over an imported film, frame by frame, as an MP4.
 
@@ -27,8 +27,8 @@ def overlay(
     Args:
         data: Folder of the recorded data set.
         id: Number of the interaction.
-        run: Folder of the training.
         out: The .mp4 file to write.
+        run: Folder of the training; by default the predictor that comes with foretrace.
         topic: Image topic of a bag, if it has several.
     """
     import numpy as np

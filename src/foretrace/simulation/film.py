@@ -175,7 +175,9 @@ def film_lever_up(
     poses = _interpolate(motion, times - action_start)[0]
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
-        film_folder.write_picture(folder / film_folder.BACKGROUND, _background(lens, obj, motion, config, rng))
+        film_folder.write_picture(
+            folder / film_folder.BACKGROUND, _background(lens, obj, motion, config, rng)
+        )
         frames = _frames(lens, obj, motion, times, action_start, config, rng)
         write_film(folder, frames, FilmNotes(action_start=None))
     truth = FilmTruth(
