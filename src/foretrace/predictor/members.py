@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MANY = 256
-"""From so many rows on, networks are better asked one after the other."""
+"""From so many rows on, networks are better asked one after the other, and their answers averaged so."""
 
 
 class Members(nn.Module):

@@ -29,7 +29,7 @@ from foretrace.predictor.futures import (
 )
 from foretrace.predictor.hinges import NUM_VALUES, PROBES, Hinges, find_hinges
 from foretrace.predictor.known import given_values
-from foretrace.predictor.members import Members
+from foretrace.predictor.members import MANY, Members
 from foretrace.predictor.states import Effects, decode_poses
 
 ODD = (1, 3, 5)
@@ -366,13 +366,13 @@ class OneShotPredictor(EffectPredictor):
         odds = said.odds.flatten(3).log_softmax(dim=-1).view_as(said.odds).mean(dim=(0, 2))
         # What the motion in the mirror is here.
         seen = torch.stack([torch.ones_like(self.parity), self.parity])[: hinges.values.shape[1]]
-        # Member by member: all of them at once would not fit into the processor's cache.
-        weights = [own * seen[:, None, None] for own in said.weights]
-        mean = torch.stack([own.mean(dim=1) for own in weights]).mean(dim=0)
         sizes = self.motions[..., :3].square().sum(dim=2).mean(dim=1)
-        apart = torch.stack([((own - mean[:, None]).square() @ sizes).mean(dim=1) for own in weights]).mean(
-            dim=0
-        )
+        # Many lever-ups member by member: all at once would not fit into the processor's cache.
+        many = torch.is_inference_mode_enabled() and len(com) >= MANY
+        parts = [part * seen[:, None, None] for part in said.weights.split(1 if many else len(said.weights))]
+        mean = torch.stack([part.mean(dim=(0, 2)) for part in parts]).mean(dim=0)
+        distances = [((part - mean[:, None]).square() @ sizes).mean(dim=(0, 2)) for part in parts]
+        apart = torch.stack(distances).mean(dim=0)
         expected = said.error.mean(dim=(0, 2)).clamp(max=LARGEST_ERROR).exp() * self.state_scale[0]
         return Mixture(
             com=com,
