@@ -18,7 +18,7 @@ GOAL = 0.05
 
 def rows() -> pd.DataFrame:
     """Rows of one-shot, and of no feature, with the number of interactions learned from."""
-    folders = ("paper", "one-shot", "more-data")
+    folders = ("paper", "more-data")
     table = pd.concat([read_results(RESULTS / folder) for folder in folders], ignore_index=True)
     kept = table["experiment"].isin(["training-size", "more-data"])
     kept |= table["experiment"].eq("features") & table["setting"].eq("shuffled")
