@@ -8,7 +8,7 @@ after dynamic time warping. Where the object slips off the blade, both end: afte
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -25,6 +25,7 @@ from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.known import true_values
+from foretrace.simulation.collect import ctrl_c_later
 from foretrace.trajectories import warped_distance
 
 CM = 100.0
@@ -239,7 +240,9 @@ def _play_all(
     jobs = (delayed(play)(subject, contact, stand_in, repeats, seed) for subject, contact in contacts)
     with parallel_config("loky", n_jobs=min(workers, max(1, len(contacts))), inner_max_num_threads=1):
         try:
-            yield from Parallel(return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")(jobs)  # pyright: ignore
+            with ctrl_c_later():
+                played = Parallel(return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")(jobs)  # pyright: ignore
+            yield from cast(Iterator[Played], played)
         except TerminatedWorkerError as error:
             raise SimulationError(
                 f"a worker process was killed, perhaps for want of memory: repeat with fewer than {workers} workers"
