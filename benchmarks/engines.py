@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from foretrace.geometry import quaternion_to_matrix
+from foretrace.interactions.motions import ContactParameters
 from foretrace.interactions.record import Effect, Outcome
+from foretrace.objects.body import Body
 from foretrace.simulation import mujoco_engine, tool
 from foretrace.simulation.collect import CollectConfig, num_trials, trial
 from foretrace.simulation.engine import ENGINES
-from foretrace.simulation.free_motion import Body, Surroundings, simulate_free_motion
+from foretrace.simulation.free_motion import simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
 
 G = 9.81
@@ -52,7 +54,7 @@ def slide(engine: str, timestep: float, friction: float = 0.3, angle: float = 0.
         upright(0.02),
         0.8,
         velocity=velocity,
-        surroundings=Surroundings(friction=friction),
+        contact_parameters=ContactParameters(friction=friction),
         engine=engine,
         timestep=timestep,
     )
@@ -67,9 +69,9 @@ def slide_diagonally(engine: str, timestep: float) -> tuple[float, float]:
 def slide_down(engine: str, timestep: float) -> tuple[float, float]:
     """How far a box slides down an incline of 40 degrees in 0.5 s [m]."""
     angle = np.deg2rad(40)
-    around = Surroundings(friction=0.5, gravity=incline(angle))
+    around = ContactParameters(friction=0.5, gravity=incline(angle))
     motion = simulate_free_motion(
-        FLAT_BOX, upright(0.02), 0.5, surroundings=around, engine=engine, timestep=timestep
+        FLAT_BOX, upright(0.02), 0.5, contact_parameters=around, engine=engine, timestep=timestep
     )
     return float(motion.poses[-1, 0]), 0.125 * G * float(np.sin(angle) - 0.5 * np.cos(angle))
 
@@ -87,9 +89,9 @@ def friction_slope(engine: str, timestep: float) -> tuple[float, float]:
     """Slope at which a box begins to slide: the friction coefficient."""
 
     def moved(angle: float) -> bool:
-        around = Surroundings(friction=0.5, gravity=incline(angle))
+        around = ContactParameters(friction=0.5, gravity=incline(angle))
         motion = simulate_free_motion(
-            FLAT_BOX, upright(0.02), 1.0, surroundings=around, engine=engine, timestep=timestep
+            FLAT_BOX, upright(0.02), 1.0, contact_parameters=around, engine=engine, timestep=timestep
         )
         return motion.poses[-1, 0] > 0.005
 
@@ -100,9 +102,9 @@ def tipping_slope(engine: str, timestep: float) -> tuple[float, float]:
     """Slope at which a box of 6 cm x 12 cm tips over: width by height."""
 
     def moved(angle: float) -> bool:
-        around = Surroundings(friction=2.0, gravity=incline(angle))
+        around = ContactParameters(friction=2.0, gravity=incline(angle))
         motion = simulate_free_motion(
-            TALL_BOX, upright(0.06), 1.5, surroundings=around, engine=engine, timestep=timestep
+            TALL_BOX, upright(0.06), 1.5, contact_parameters=around, engine=engine, timestep=timestep
         )
         return abs(motion.poses[-1, 5]) > 0.2
 
@@ -111,29 +113,31 @@ def tipping_slope(engine: str, timestep: float) -> tuple[float, float]:
 
 def roll_down(engine: str, timestep: float) -> tuple[float, float]:
     """Acceleration of a cylinder that rolls down an incline of 0.15 rad [m/s^2]."""
-    around = Surroundings(gravity=incline(0.15))
-    motion = simulate_free_motion(CYLINDER, LYING, 1.0, surroundings=around, engine=engine, timestep=timestep)
+    around = ContactParameters(gravity=incline(0.15))
+    motion = simulate_free_motion(
+        CYLINDER, LYING, 1.0, contact_parameters=around, engine=engine, timestep=timestep
+    )
     return 2 * float(motion.poses[-1, 0]), 2 / 3 * G * float(np.sin(0.15))
 
 
 def roll_out(engine: str, timestep: float) -> tuple[float, float]:
     """How far a cylinder rolls that starts at 0.5 m/s against a lever arm of 3 mm [m]."""
-    arm, around = 0.003, Surroundings(rolling_friction=0.003)
+    arm, around = 0.003, ContactParameters(rolling_friction=0.003)
     velocity = [0.5, 0.0, 0.0, 0.0, 0.5 / 0.03, 0.0]
     motion = simulate_free_motion(
-        CYLINDER, LYING, 1.5, velocity=velocity, surroundings=around, engine=engine, timestep=timestep
+        CYLINDER, LYING, 1.5, velocity=velocity, contact_parameters=around, engine=engine, timestep=timestep
     )
     return float(motion.poses[:, 0].max()), 0.5**2 / 2 / (2 / 3 * G * arm / 0.03)
 
 
 def bounce(engine: str, timestep: float) -> tuple[float, float]:
     """Share of the speed that a cube keeps which falls by 20 cm, of restitution 0.5."""
-    around, fall = Surroundings(restitution=0.5), float(np.sqrt(2 * 0.2 / G))
+    around, fall = ContactParameters(restitution=0.5), float(np.sqrt(2 * 0.2 / G))
     motion = simulate_free_motion(
         Body.box((0.04, 0.04, 0.04), 0.1),
         upright(0.22),
         0.6,
-        surroundings=around,
+        contact_parameters=around,
         engine=engine,
         timestep=timestep,
     )
@@ -144,10 +148,16 @@ def bounce(engine: str, timestep: float) -> tuple[float, float]:
 def tumble(engine: str, timestep: float) -> tuple[float, float]:
     """Kinetic energy of a box that tumbled for 1 s without gravity, by its energy at the start."""
     velocity = [0.3, 0.0, 2.0, 3.0, 7.0, 2.0]
-    around = Surroundings(gravity=(0.0, 0.0, 0.0))
+    around = ContactParameters(gravity=(0.0, 0.0, 0.0))
     body = Body.box((0.10, 0.06, 0.02), 0.3)
     motion = simulate_free_motion(
-        body, upright(5.0), 1.0, velocity=velocity, surroundings=around, engine=engine, timestep=timestep
+        body,
+        upright(5.0),
+        1.0,
+        velocity=velocity,
+        contact_parameters=around,
+        engine=engine,
+        timestep=timestep,
     )
     R, spin = quaternion_to_matrix(motion.poses[:, 3:]), motion.velocities[:, 3:]
     momentum = np.einsum("tij,jk,tlk,tl->ti", R, body.mass.inertia, R, spin)

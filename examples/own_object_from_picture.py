@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 import foretrace as ft
-from foretrace.evaluation.figures import interaction_figure
+from foretrace.pictures.scene import interaction_figure
 
 METRES_PER_PIXEL = 0.0005
 HEIGHT = 0.015

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pandas as pd
 
-from foretrace.evaluation.claims import PAIRS, PAPER_FEATURES, SIZES
+from foretrace.experiments.claims import PAIRS, PAPER_FEATURES, SIZES
 
 COLUMNS = ["experiment", "features", "seed", "setting", "metric", "value"]
 ERRORS = {

@@ -10,11 +10,13 @@ from foretrace.actions import LeverUp, ToolPath
 from foretrace.cli import main
 from foretrace.errors import SimulationError
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.motions import GRAVITY, ContactParameters
 from foretrace.interactions.record import Outcome, Physics
 from foretrace.objects import NO_BEVEL, HullShape, Prism
+from foretrace.objects.body import Body
 from foretrace.simulation.bullet_engine import BulletEngine
 from foretrace.simulation.bullet_world import COLLISION_MARGIN, World, connect
-from foretrace.simulation.free_motion import GRAVITY, Body, Surroundings, simulate_free_motion
+from foretrace.simulation.free_motion import simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.tool import Tool
 
@@ -84,7 +86,7 @@ def test_every_pair_has_its_own_friction(table: float, tool: float) -> None:
         [0, 0, 0.02, 1, 0, 0, 0],
         0.2,
         velocity=[1.0, 0, 0, 0, 0, 0],
-        surroundings=Surroundings(friction=table),
+        contact_parameters=ContactParameters(friction=table),
         engine="bullet",
     )
     assert 1.0 - motion.velocities[50, 0] == pytest.approx(table * 9.81 * 0.1, rel=0.03)

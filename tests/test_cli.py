@@ -133,7 +133,7 @@ def test_evaluate_paper_goes_on_and_prints_what_it_found(folder, tmp_path, capsy
     def train_little(batch, config, *arguments, **options):
         return fit_predictor(batch, replace(config, hidden=4, min_steps=1), *arguments, **options)
 
-    monkeypatch.setattr("foretrace.evaluation.protocol.fit_predictor", train_little)
+    monkeypatch.setattr("foretrace.experiments.paper_protocol.fit_predictor", train_little)
     out = tmp_path / "results"
     command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1 --epochs 1".split()
     command += ["--experiments", "features", "support-points", "--settings", "shuffled", "100"]

@@ -17,8 +17,8 @@ from foretrace.export.episodes import Episode, choose
 from foretrace.export.pictures import CAMERA, camera_pose, take_pictures
 from foretrace.export.resampling import frame_times, frames_per_second, resample_poses
 from foretrace.geometry import invert_transform, pose_to_matrix, transform_points
+from foretrace.imagined import ImaginedEffect
 from foretrace.interactions.record import Outcome
-from foretrace.predictor.base import ImaginedEffect
 
 
 @pytest.fixture(scope="module")

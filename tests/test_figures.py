@@ -10,13 +10,14 @@ from PIL import Image
 import factories
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, PredictionError
-from foretrace.evaluation import animation, figures
-from foretrace.evaluation.figures import Scene, contact_sheet, interaction_figure, scene_figure
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
 from foretrace.objects import Prism
 from foretrace.objects.surface import faces_of
+from foretrace.pictures import animation
+from foretrace.pictures import scene as figures
+from foretrace.pictures.scene import Scene, contact_sheet, interaction_figure, scene_figure
 
 
 @pytest.fixture(scope="module")

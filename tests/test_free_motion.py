@@ -12,8 +12,10 @@ import pytest
 from engines_at_hand import WITHOUT_BULLET, every_engine
 from foretrace.errors import SimulationError
 from foretrace.geometry import quaternion_to_matrix
+from foretrace.interactions.motions import ContactParameters
 from foretrace.objects import MassProperties, Prism
-from foretrace.simulation.free_motion import Body, Surroundings, simulate_free_motion
+from foretrace.objects.body import Body
+from foretrace.simulation.free_motion import simulate_free_motion
 
 PROGRAM = Path(__file__).parents[1] / "benchmarks" / "engines.py"
 SPEC = importlib.util.spec_from_file_location("benchmark_engines", PROGRAM)
@@ -64,11 +66,13 @@ def test_a_resting_box_stays(engine: str) -> None:
 
 @every_engine
 def test_momentum_is_conserved_in_flight(engine: str) -> None:
-    around = Surroundings(gravity=(0.0, 0.0, 0.0))
+    around = ContactParameters(gravity=(0.0, 0.0, 0.0))
     body = Body(MassProperties(0.3, np.array([0.01, -0.02, 0.005]), BOX.mass.inertia), BOX.shapes)
     start = [0.0, 0.0, 5.0, 0.8, 0.6, 0.0, 0.0]
     velocity = np.array([0.3, -0.1, 0.5, 3.0, 7.0, 2.0])
-    motion = simulate_free_motion(body, start, 1.0, velocity=velocity, surroundings=around, engine=engine)
+    motion = simulate_free_motion(
+        body, start, 1.0, velocity=velocity, contact_parameters=around, engine=engine
+    )
     np.testing.assert_allclose(motion.velocities[:, :3], velocity[None, :3].repeat(501, 0), atol=1e-9)
     R = quaternion_to_matrix(motion.poses[:, 3:])
     com = motion.poses[:, :3] + R @ body.mass.com
@@ -81,7 +85,12 @@ def test_momentum_is_conserved_in_flight(engine: str) -> None:
 @every_engine
 def test_sliding_never_gains_energy(engine: str) -> None:
     motion = simulate_free_motion(
-        BOX, LYING_FLAT, 0.5, velocity=[0.8, 0.3, 0, 0, 0, 4.0], surroundings=Surroundings(0.3), engine=engine
+        BOX,
+        LYING_FLAT,
+        0.5,
+        velocity=[0.8, 0.3, 0, 0, 0, 4.0],
+        contact_parameters=ContactParameters(0.3),
+        engine=engine,
     )
     R = quaternion_to_matrix(motion.poses[:, 3:])
     spin = np.einsum("tji,tj->ti", R, motion.velocities[:, 3:])
@@ -145,7 +154,7 @@ def test_bad_values_are_refused(change: dict[str, Any], message: str) -> None:
 )
 def test_bad_surroundings_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(SimulationError, match=next(iter(settings))):
-        Surroundings(**settings)
+        ContactParameters(**settings)
 
 
 def test_impossible_bodies_are_refused() -> None:

@@ -12,15 +12,15 @@ from foretrace.actions import Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
-from foretrace.evaluation.experiments import measure_errors
-from foretrace.evaluation.protocol import Recipe
+from foretrace.evaluation.metrics import measure_errors
+from foretrace.experiments.paper_protocol import Recipe
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor import TrainConfig, load_predictor, train_predictor
 from foretrace.predictor.checkpoint import read_config
-from foretrace.predictor.known import PARAMETERS, true_values
+from foretrace.predictor.context import PARAMETERS, true_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.training import fit_predictor
 

@@ -15,7 +15,7 @@ import trimesh
 from PIL import Image
 
 from foretrace import cli
-from foretrace.evaluation.experiments import at_times
+from foretrace.evaluation.metrics import at_times
 from foretrace.predictor import ImaginedBatch
 
 ROOT = Path(__file__).parents[1]

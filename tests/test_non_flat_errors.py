@@ -11,11 +11,12 @@ from PIL import Image
 
 from foretrace.cli import main
 from foretrace.errors import DatasetError
-from foretrace.evaluation import non_flat_errors
-from foretrace.evaluation.non_flat_errors import NonFlatData, example_paths, measure, spread_of_fates
-from foretrace.evaluation.non_flat_report import errors_figure, markdown, paths_figure, summarise
+from foretrace.experiments import non_flat_errors
+from foretrace.experiments.non_flat_errors import NonFlatData, example_paths, measure, spread_of_fates
+from foretrace.experiments.non_flat_report import errors_figure, markdown, paths_figure, summarise
+from foretrace.imagined import ImaginedBatch
 from foretrace.predictor import TrainConfig, train_predictor
-from foretrace.predictor.base import EffectPredictor, ImaginedBatch
+from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.states import valid_lengths
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig

@@ -13,12 +13,13 @@ from foretrace.features import make_features
 from foretrace.features.outline import MAX_CORNERS, UNIT
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
+from foretrace.imagined import FLOOR, LEVELS, Futures, quantiles_of
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism
 from foretrace.predictor import OneShotConfig, OneShotPredictor, load_predictor, save_checkpoint
-from foretrace.predictor.futures import FLOOR, LEVELS, Futures, along_hinges, quantiles_of
-from foretrace.predictor.hinges import NUM_VALUES, PROBES, RIM, find_hinges, mirror_corners
+from foretrace.predictor.mixture import along_hinges
+from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, RIM, find_hinges, mirror_corners
 from foretrace.predictor.states import decode_poses, encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error

@@ -17,10 +17,10 @@ from export_samples import write_data
 from foretrace import cli
 from foretrace.cli.futures import futures_content, outlook_of, radius_of, say_futures
 from foretrace.errors import CheckpointError
-from foretrace.evaluation.figures import Scene, legend_of, scene_figure
+from foretrace.imagined import LEVELS, conformal_scores
 from foretrace.interactions.dataset import Dataset
+from foretrace.pictures.scene import Scene, legend_of, scene_figure
 from foretrace.predictor import RECIPES, Futures, ImaginedEffect, checkpoint, part_of, train_predictor
-from foretrace.predictor.futures import LEVELS, conformal_scores
 
 SAMPLES = 24
 CONFIG = replace(

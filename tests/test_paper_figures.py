@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from foretrace import cli
-from foretrace.evaluation.charts import seeds_in_words
-from foretrace.evaluation.claims import CLAIMS
-from foretrace.evaluation.paper_figures import FIGURES, write_figures
 from foretrace.evaluation.results import ResultsTable, Trial
+from foretrace.experiments.charts import seeds_in_words
+from foretrace.experiments.claims import CLAIMS
+from foretrace.experiments.paper_figures import FIGURES, write_figures
 from result_tables import ERRORS, paper_like
 
 

@@ -11,12 +11,12 @@ from rich.console import Console
 
 import factories
 from foretrace.errors import ResultsError, TrainingError
-from foretrace.evaluation import protocol
-from foretrace.evaluation.comparisons import EXPERIMENTS, plan, split_of
-from foretrace.evaluation.experiments import evaluate_predictor, measure_errors
-from foretrace.evaluation.protocol import Recipe, count_missing, load_levered, run_protocol
+from foretrace.evaluation.metrics import evaluate_predictor, measure_errors
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, read_results
 from foretrace.evaluation.runner import run_trials
+from foretrace.experiments import paper_protocol as protocol
+from foretrace.experiments.paper_protocol import Recipe, count_missing, load_levered, run_protocol
+from foretrace.experiments.paper_trials import EXPERIMENTS, plan, split_of
 from foretrace.features import FEATURES
 from foretrace.interactions.record import Outcome
 from foretrace.predictor import RECIPES, TrainConfig

@@ -11,10 +11,10 @@ from engines_at_hand import WITHOUT_BULLET
 from foretrace.actions import USUAL_STROKE, LeverUp, Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError
-from foretrace.evaluation.description import describe_dataset
 from foretrace.geometry import transform_points
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.description import describe_dataset
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import AS_TOLD, Interaction, Misplacement, Physics
 from foretrace.interactions.topdown import TopDownView

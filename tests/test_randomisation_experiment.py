@@ -10,8 +10,9 @@ from engines_at_hand import WITHOUT_BULLET
 from foretrace.actions import LeverUp, Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.errors import DatasetError, ResultsError
-from foretrace.evaluation import randomisation
-from foretrace.evaluation.randomisation import (
+from foretrace.evaluation.results import Trial, read_results
+from foretrace.experiments import randomisation
+from foretrace.experiments.randomisation import (
     KNOWING,
     NAMES,
     PLAIN,
@@ -23,7 +24,7 @@ from foretrace.evaluation.randomisation import (
     run_randomisation,
     split_both,
 )
-from foretrace.evaluation.randomisation_report import (
+from foretrace.experiments.randomisation_report import (
     BARS,
     JUDGES,
     NOMINAL,
@@ -31,15 +32,15 @@ from foretrace.evaluation.randomisation_report import (
     randomisation_figure,
     summarise,
 )
-from foretrace.evaluation.results import Trial, read_results
-from foretrace.evaluation.stand_in import StandIn
-from foretrace.evaluation.transfer_objects import PENTAGON, Subject
+from foretrace.experiments.transfer_objects import PENTAGON, Subject
+from foretrace.imagined import ImaginedBatch
 from foretrace.interactions.record import Outcome, Physics
 from foretrace.predictor import TrainConfig
-from foretrace.predictor.base import EffectPredictor, ImaginedBatch
-from foretrace.predictor.known import PARAMETERS
+from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.context import PARAMETERS
 from foretrace.simulation.collect import CollectConfig, collect, trial
 from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION, Randomisation
+from foretrace.simulation.stand_in import StandIn
 
 QUIET = Console(quiet=True)
 RECIPE = RandomisationRecipe(TrainConfig(hidden=8, epochs=1, min_steps=1, device="cpu", threads=1), repeats=1)

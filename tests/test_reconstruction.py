@@ -3,7 +3,7 @@ import pytest
 
 from factories import QUICK_OPTIONS, fake_batch
 from foretrace.errors import PredictionError
-from foretrace.evaluation.reconstruction import overlap, reconstruct_masks, reconstruction_figure
+from foretrace.experiments.reconstruction import overlap, reconstruct_masks, reconstruction_figure
 from foretrace.predictor import TrainConfig
 
 

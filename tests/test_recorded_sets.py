@@ -9,7 +9,7 @@ import pytest
 
 from foretrace.cli import main
 from foretrace.errors import DatasetError
-from foretrace.evaluation.transfer_recorded import levered_edge
+from foretrace.experiments.transfer_recorded import levered_edge
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.recorded import NOTES_FOLDER, read_notes
 from foretrace.perception.films import open_film

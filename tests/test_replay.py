@@ -13,9 +13,10 @@ import trimesh
 from engines_at_hand import every_engine
 from foretrace.cli import main
 from foretrace.errors import DatasetError
-from foretrace.evaluation.recordings import Recording, read_recordings
-from foretrace.evaluation.replay import estimate_velocity, replay
-from foretrace.simulation.free_motion import Body, Surroundings, simulate_free_motion
+from foretrace.experiments.replay import estimate_velocity, replay
+from foretrace.interactions.motions import ContactParameters, Recording, read_recordings
+from foretrace.objects.body import Body
+from foretrace.simulation.free_motion import simulate_free_motion
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "replay_recording" / "recordings.json"
 TIMES = np.arange(31) / 30
@@ -29,7 +30,7 @@ def entry(**changes: Any) -> dict[str, Any]:
         [0, 0, 0.02, 1, 0, 0, 0],
         1.0,
         velocity=[0.7, 0, 0, 0, 0, 0],
-        surroundings=Surroundings(0.4, restitution=0.0),
+        contact_parameters=ContactParameters(0.4, restitution=0.0),
         timestep=0.001,
     ).at(TIMES)
     values = {

@@ -6,7 +6,7 @@ import torch
 
 from factories import fake_batch
 from foretrace.errors import TrainingError
-from foretrace.evaluation.support import CHOICES, support_point_metrics
+from foretrace.experiments.support import CHOICES, support_point_metrics
 from foretrace.interactions.splits import Split
 
 QUICK = {"epochs": 8, "batch_size": 8, "snapped": False}

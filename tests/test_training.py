@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from factories import QUICK_OPTIONS, fake_batch
 from foretrace.errors import CheckpointError, TrainingError
-from foretrace.evaluation.experiments import evaluate_predictor
+from foretrace.evaluation.metrics import evaluate_predictor
 from foretrace.features import FEATURES, Autoencoder256, NoFeatures
 from foretrace.interactions.splits import Split
 from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor

@@ -14,10 +14,9 @@ import torch
 from foretrace.actions import LeverUp
 from foretrace.cli import main
 from foretrace.errors import PredictionError, ShapeError, SimulationError, ViewError
-from foretrace.evaluation import transfer_objects
-from foretrace.evaluation.stand_in import Observation, Perturbation, StandIn, hull_of
-from foretrace.evaluation.transfer import distance_until_slip, evaluate_transfer, own_error
-from foretrace.evaluation.transfer_objects import (
+from foretrace.experiments import transfer_objects
+from foretrace.experiments.transfer import distance_until_slip, evaluate_transfer, own_error
+from foretrace.experiments.transfer_objects import (
     HEPTAGON,
     PENTAGON,
     Subject,
@@ -28,13 +27,14 @@ from foretrace.evaluation.transfer_objects import (
     read_prisms,
     read_silhouettes,
 )
-from foretrace.evaluation.transfer_report import DISTANCES, PAPER_PREDICTED, bar_lines, markdown, summarise
+from foretrace.experiments.transfer_report import DISTANCES, PAPER_PREDICTED, bar_lines, markdown, summarise
 from foretrace.geometry import convex_hull, transform_points
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import Prism
 from foretrace.predictor import ImaginedEffect, TrainConfig, save_checkpoint
 from foretrace.simulation import bullet_world, lever_up
+from foretrace.simulation.stand_in import Observation, Perturbation, StandIn, hull_of
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="real data are not here")

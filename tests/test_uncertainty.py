@@ -12,14 +12,14 @@ from rich.console import Console
 import factories
 from foretrace.cli import main
 from foretrace.errors import DatasetError
-from foretrace.evaluation import uncertainty
-from foretrace.evaluation import uncertainty_metrics as metrics
-from foretrace.evaluation.uncertainty_metrics import ALL, Part
-from foretrace.evaluation.uncertainty_report import markdown, summarise
-from foretrace.evaluation.uncertainty_scores import constant_deviations, score
+from foretrace.experiments import uncertainty
+from foretrace.experiments import uncertainty_metrics as metrics
+from foretrace.experiments.uncertainty_metrics import ALL, Part
+from foretrace.experiments.uncertainty_report import markdown, summarise
+from foretrace.experiments.uncertainty_scores import constant_deviations, score
+from foretrace.imagined import LEVELS
 from foretrace.interactions.record import AS_TOLD, Outcome
 from foretrace.predictor import Futures, ImaginedBatch, load_predictor
-from foretrace.predictor.futures import LEVELS
 from foretrace.predictor.states import decode_poses
 from foretrace.simulation.collect import CollectConfig, collect
 

@@ -6,8 +6,8 @@ import matplotlib as mpl
 import pandas as pd
 from matplotlib.figure import Figure
 
-from foretrace.evaluation.figures import INK, STYLE
 from foretrace.evaluation.results import read_results
+from foretrace.pictures.scene import INK, STYLE
 
 RESULTS = Path(__file__).parents[1] / "results"
 LEVERED = 1814

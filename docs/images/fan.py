@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.animation import interaction_animation
-from foretrace.evaluation.figures import CM, GREY, INK, STYLE, TOOL_COLOR, silhouette, tool_line
-from foretrace.evaluation.tubes import Outlook
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
+from foretrace.pictures.animation import interaction_animation
+from foretrace.pictures.scene import CM, GREY, INK, STYLE, TOOL_COLOR, silhouette, tool_line
+from foretrace.pictures.tubes import Outlook
 from foretrace.predictor import ImaginedEffect, load_predictor, part_of
 from foretrace.trajectories import mean_distance
 

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from foretrace.simulation.free_motion import Body, Surroundings, simulate_free_motion
+from foretrace.interactions.motions import ContactParameters
+from foretrace.objects.body import Body
+from foretrace.simulation.free_motion import simulate_free_motion
 
 SEED = 3
 FRAME_RATE = 60.0
@@ -23,10 +25,10 @@ ROTATION_NOISE = np.deg2rad(0.2)
 
 def record(name: str, geometry: dict, body: Body, pose: list, velocity: list | None, duration: float) -> dict:
     rng = np.random.default_rng([SEED, len(name)])
-    around = Surroundings(friction=0.6, restitution=0.1)
+    around = ContactParameters(friction=0.6, restitution=0.1)
     speed = [0.0] * 6 if velocity is None else velocity
     motion = simulate_free_motion(
-        body, pose, duration, velocity=speed, surroundings=around, timestep=0.0005
+        body, pose, duration, velocity=speed, contact_parameters=around, timestep=0.0005
     ).at(np.arange(round(duration * FRAME_RATE) + 1) / FRAME_RATE)
     poses = motion.poses.copy()
     poses[:, :3] += rng.normal(0, POSITION_NOISE, (len(poses), 3))

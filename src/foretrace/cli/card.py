@@ -13,7 +13,7 @@ def card(run: Positional[Path], data: Path, out: Path | None = None) -> None:
         data: Folder of the data set that it was trained on.
         out: File to write; by default MODEL_CARD.md in the run's folder.
     """
-    from foretrace.evaluation.model_card import model_card
+    from foretrace.predictor.model_card import model_card
 
     out = run / "MODEL_CARD.md" if out is None else out
     text = model_card(run, data)

@@ -109,9 +109,9 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
         out: File to write (.png, .svg, .pdf; with an id also .gif, .mp4). By default pictures go to the
             folder's ``figures``.
     """
-    from foretrace.evaluation.animation import interaction_animation
-    from foretrace.evaluation.figures import contact_sheet, interaction_figure
     from foretrace.interactions.dataset import Dataset
+    from foretrace.pictures.animation import interaction_animation
+    from foretrace.pictures.scene import contact_sheet, interaction_figure
 
     moving, still = (".gif", ".mp4"), (".png", ".svg", ".pdf")
     if out is not None and out.suffix.lower() not in moving + still:
@@ -143,8 +143,8 @@ def describe(path: Positional[Path], out: Path | None = None) -> None:
     """
     import json
 
-    from foretrace.evaluation.description import describe_dataset
     from foretrace.interactions.dataset import Dataset
+    from foretrace.interactions.description import describe_dataset
 
     figures = describe_dataset(Dataset.open(path))
     _print_outcomes(figures["outcomes"])

@@ -8,9 +8,9 @@ from foretrace.cli.evaluation import print_errors
 from foretrace.cli.outlines import read_mask
 
 if TYPE_CHECKING:
-    from foretrace.evaluation.figures import Scene
     from foretrace.interactions.record import Interaction
     from foretrace.interactions.topdown import TopDownView
+    from foretrace.pictures.scene import Scene
     from foretrace.predictor import EffectPredictor
 
 RACKET_SCALE = 0.0005
@@ -35,10 +35,10 @@ def demo(
     """
     from dataclasses import replace
 
-    from foretrace.evaluation.animation import scene_animation
-    from foretrace.evaluation.experiments import evaluate_predictor
-    from foretrace.evaluation.figures import comparison_figure, contact_sheet
+    from foretrace.evaluation.metrics import evaluate_predictor
     from foretrace.interactions.dataset import Dataset
+    from foretrace.pictures.animation import scene_animation
+    from foretrace.pictures.scene import comparison_figure, contact_sheet
     from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
 
@@ -112,7 +112,7 @@ def _scene(
 ) -> "Scene":
     from dataclasses import replace
 
-    from foretrace.evaluation.figures import Scene
+    from foretrace.pictures.scene import Scene
 
     paths = {name: predictor.imagine(view).com_trajectory for name, predictor in predictors.items()}
     return replace(Scene.observed(interaction, paths), title=title)

@@ -28,7 +28,7 @@ def evaluate_predictor(
     """
     import pandas as pd
 
-    from foretrace.evaluation import experiments
+    from foretrace.evaluation import metrics as experiments
     from foretrace.interactions.dataset import Dataset
     from foretrace.predictor import load_predictor, part_of
 
@@ -77,9 +77,9 @@ def evaluate_paper(
     """
     from dataclasses import replace
 
-    from foretrace.evaluation import protocol
-    from foretrace.evaluation.comparisons import plan
     from foretrace.evaluation.results import read_results
+    from foretrace.experiments import paper_protocol as protocol
+    from foretrace.experiments.paper_trials import plan
 
     trials = plan(experiments or None, features or None, settings or None, seeds)
     recipe = protocol.Recipe(proportional=proportional)

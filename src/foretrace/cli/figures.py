@@ -19,9 +19,9 @@ def figures(results: Positional[tuple[Path, ...]], out: Path | None = None) -> N
     import pandas as pd
 
     from foretrace.errors import ResultsError
-    from foretrace.evaluation.claims import judge_claims, write_claims
-    from foretrace.evaluation.paper_figures import write_figures
     from foretrace.evaluation.results import read_results
+    from foretrace.experiments.claims import judge_claims, write_claims
+    from foretrace.experiments.paper_figures import write_figures
 
     if not results:
         raise ResultsError("no folder of results: give at least one")
@@ -44,7 +44,7 @@ def _print_claims(rows: list[dict]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from foretrace.evaluation.claims import holds_in_words, tally
+    from foretrace.experiments.claims import holds_in_words, tally
 
     printed = Table("paper", "claim", "holds here", "result", title="The paper's claims")
     for row in rows:

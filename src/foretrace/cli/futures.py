@@ -7,7 +7,7 @@ import numpy as np
 from foretrace.cli.console import say
 
 if TYPE_CHECKING:
-    from foretrace.evaluation.tubes import Outlook
+    from foretrace.pictures.tubes import Outlook
     from foretrace.predictor import Futures, ImaginedEffect
 
 LEVEL = 0.9
@@ -20,7 +20,7 @@ LEAST_PROBABLE = 0.01
 
 def outlook_of(imagined: "ImaginedEffect") -> "Outlook":
     """What to draw beside the path."""
-    from foretrace.evaluation.tubes import Outlook
+    from foretrace.pictures.tubes import Outlook
 
     futures, radius = imagined.futures, radius_of(imagined)
     if futures is None:

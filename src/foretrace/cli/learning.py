@@ -187,9 +187,9 @@ def predict(
 
     from foretrace.actions import Stroke
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
-    from foretrace.evaluation.animation import scene_animation
-    from foretrace.evaluation.figures import Scene, scene_figure
     from foretrace.interactions.record import Physics
+    from foretrace.pictures.animation import scene_animation
+    from foretrace.pictures.scene import Scene, scene_figure
     from foretrace.predictor import load_predictor
     from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     import pandas as pd
 
-    from foretrace.evaluation.non_flat_errors import NonFlatData, Setting
+    from foretrace.experiments.non_flat_errors import NonFlatData, Setting
     from foretrace.predictor import EffectPredictor, TrainConfig
 
 KEPT = "trainings"
@@ -48,7 +48,7 @@ def evaluate_non_flat(
     import pandas as pd
 
     from foretrace.errors import ResultsError
-    from foretrace.evaluation import non_flat_errors as experiment
+    from foretrace.experiments import non_flat_errors as experiment
     from foretrace.predictor import RECIPES
 
     if out.exists() and not out.is_dir():
@@ -82,7 +82,7 @@ def _one_split(
     import pandas as pd
 
     from foretrace.cli.console import say
-    from foretrace.evaluation import non_flat_errors as experiment
+    from foretrace.experiments import non_flat_errors as experiment
     from foretrace.predictor import load_predictor
 
     tables, predictors = [], {}
@@ -102,7 +102,7 @@ def _write(out: Path, errors: "pd.DataFrame", paths: "pd.DataFrame", floors: "pd
     """Tables, summary and pictures; the table is printed, too."""
     import json
 
-    from foretrace.evaluation import non_flat_report as report
+    from foretrace.experiments import non_flat_report as report
 
     for name, table in (("errors.csv", errors), ("paths.csv", paths), ("floors.csv", floors)):
         if not table.empty:

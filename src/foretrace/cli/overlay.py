@@ -9,8 +9,8 @@ from tyro.conf import Positional
 if TYPE_CHECKING:
     import numpy as np
 
+    from foretrace.imagined import ImaginedEffect
     from foretrace.interactions.record import Interaction
-    from foretrace.predictor.base import ImaginedEffect
 
 
 def overlay(
@@ -34,7 +34,7 @@ def overlay(
     import numpy as np
 
     from foretrace.errors import DatasetError, PerceptionError
-    from foretrace.evaluation.transfer_figures import side_figure
+    from foretrace.experiments.transfer_figures import side_figure
     from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.recorded import read_notes
     from foretrace.perception.films import open_film

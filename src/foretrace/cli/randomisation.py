@@ -44,8 +44,8 @@ def evaluate_randomisation(
     import json
     from dataclasses import replace
 
-    from foretrace.evaluation import randomisation, randomisation_report
     from foretrace.evaluation.results import read_results
+    from foretrace.experiments import randomisation, randomisation_report
     from foretrace.predictor import RECIPES
 
     if predictor not in RECIPES:

@@ -19,7 +19,7 @@ def evaluate_reconstruction(
     import numpy as np
 
     from foretrace.errors import PredictionError
-    from foretrace.evaluation.reconstruction import overlap, reconstruct_masks, reconstruction_figure
+    from foretrace.experiments.reconstruction import overlap, reconstruct_masks, reconstruction_figure
     from foretrace.interactions.dataset import Dataset
     from foretrace.predictor import load_predictor, part_of
 

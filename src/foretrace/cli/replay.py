@@ -27,8 +27,8 @@ def evaluate_replay(
     from rich.table import Table
 
     from foretrace.errors import DatasetError
-    from foretrace.evaluation.recordings import read_recordings
-    from foretrace.evaluation.replay import replay
+    from foretrace.experiments.replay import replay
+    from foretrace.interactions.motions import read_recordings
 
     if not recordings:
         raise DatasetError("no recording is given: name at least one file")

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from foretrace.evaluation.transfer import Transfer
+    from foretrace.experiments.transfer import Transfer
     from foretrace.predictor.base import EffectPredictor
 
 
@@ -49,9 +49,9 @@ def evaluate_transfer(
         height: Thickness of silhouettes, and of prisms that do not tell it [m].
     """
     from foretrace.errors import ResultsError, ShapeError
-    from foretrace.evaluation import transfer, transfer_objects, transfer_report
-    from foretrace.evaluation.stand_in import StandIn
+    from foretrace.experiments import transfer, transfer_objects, transfer_report
     from foretrace.predictor import load_predictor
+    from foretrace.simulation.stand_in import StandIn
 
     if out.exists() and not out.is_dir():
         raise ResultsError(f"{out} is a file: give a folder to write to")
@@ -87,9 +87,9 @@ def _evaluate_recorded(
     predictor: "EffectPredictor", recorded: Path, out: Path, settings: dict[str, Any]
 ) -> None:
     """Tables and picture of a recorded data set."""
-    from foretrace.evaluation import transfer_report
-    from foretrace.evaluation.transfer_figures import paths_figure
-    from foretrace.evaluation.transfer_recorded import evaluate_recorded
+    from foretrace.experiments import transfer_report
+    from foretrace.experiments.transfer_figures import paths_figure
+    from foretrace.experiments.transfer_recorded import evaluate_recorded
     from foretrace.interactions.dataset import Dataset
 
     found = evaluate_recorded(predictor, Dataset.open(recorded))
@@ -116,8 +116,8 @@ def _settings(run: Path | None, predictor: "EffectPredictor", *engines: str) -> 
 
 def _stand_in_figures(found: "Transfer") -> dict[str, "Figure"]:
     """Paths at some printed edges, and masks and errors of each group of other objects, by file name."""
-    from foretrace.evaluation.transfer_figures import objects_figure, paths_figure
-    from foretrace.evaluation.transfer_report import PAPER_OBJECTS
+    from foretrace.experiments.transfer_figures import objects_figure, paths_figure
+    from foretrace.experiments.transfer_report import PAPER_OBJECTS
 
     shown = {("pentagon", 1), ("pentagon", 3), ("heptagon", 2), ("heptagon", 6)}
     printed = [

@@ -47,9 +47,9 @@ def evaluate_uncertainty(
 
     from foretrace.cli.console import say
     from foretrace.errors import ResultsError
-    from foretrace.evaluation import uncertainty as experiment
+    from foretrace.experiments import uncertainty as experiment
     from foretrace.predictor import OneShotPredictor, load_predictor
-    from foretrace.predictor.surroundings import thread_count
+    from foretrace.predictor.runtime import thread_count
 
     if out.exists() and not out.is_dir():
         raise ResultsError(f"{out} is a file: give a folder to write to")
@@ -91,8 +91,8 @@ def _write(out: Path, rows: "pd.DataFrame") -> None:
 
     import matplotlib as mpl
 
-    from foretrace.evaluation import uncertainty_figures as figures
-    from foretrace.evaluation import uncertainty_report as report
+    from foretrace.experiments import uncertainty_figures as figures
+    from foretrace.experiments import uncertainty_report as report
 
     summary = report.summarise(rows)
     text = report.markdown(summary)

@@ -9,10 +9,11 @@ from jaxtyping import Float
 
 from foretrace.errors import ExportError, PredictionError
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
+from foretrace.imagined import ImaginedEffect
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
 from foretrace.predictor import load_predictor, parts_of
-from foretrace.predictor.base import EffectPredictor, ImaginedEffect
+from foretrace.predictor.base import EffectPredictor
 
 REST = "rest"
 """What is in no part of a training's split: of outcomes that it leaves out, or cut off by the parts' sizes."""

@@ -15,13 +15,13 @@ from foretrace.features.cnn import HEIGHT_SCALE
 from foretrace.features.outline import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.features.windows import convolve_unbranched
 from foretrace.geometry import convex_hull, quaternion_to_matrix, rotation_from_6d
+from foretrace.imagined import FLOOR, LEVELS
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism
 from foretrace.predictor import EffectPredictor, OneShotPredictor
 from foretrace.predictor.base import estimate_com
-from foretrace.predictor.futures import FLOOR, LEVELS
-from foretrace.predictor.known import KNOWN
+from foretrace.predictor.context import KNOWN
 from foretrace.predictor.states import rest_states
 
 FRAME = "action: origin at the contact point on the table top, x along the action, y left, z up"

@@ -1,8 +1,8 @@
 """Predictors of an action's effect: networks, their training, their checkpoints."""
 
-from foretrace.predictor.base import EffectPredictor, ImaginedBatch, ImaginedEffect
+from foretrace.imagined import Futures, ImaginedBatch, ImaginedEffect
+from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import PREDICTORS, load_predictor, save_checkpoint
-from foretrace.predictor.futures import Futures
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.run_folder import part_of, parts_of

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -15,11 +15,11 @@ from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import FeatureExtractor, Outline, Precision
 from foretrace.features.outline import count_corners
 from foretrace.geometry import continuous_rotation_vectors, quaternion_to_matrix
+from foretrace.imagined import ImaginedBatch, ImaginedEffect
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, TopDownView
+from foretrace.predictor.context import check_names, given_values, observed_values
 from foretrace.predictor.domain import Ranges, check_view, find_unusual, measure
-from foretrace.predictor.futures import Futures
-from foretrace.predictor.known import check_names, given_values, observed_values
 from foretrace.predictor.states import (
     Effects,
     StateKind,
@@ -35,49 +35,7 @@ ROWS_AT_ONCE = 256
 
 Start = Literal["observed", "estimated"]
 """Where a roll-out's first state comes from: the first recorded sample, or the view from above."""
-
-
-@dataclass(frozen=True)
-class ImaginedEffect:
-    """The effect that a predictor expects of one action."""
-
-    times: Float[np.ndarray, " time"]
-    """Time of each sample [s], from the moment before the blade touches the object."""
-    com_trajectory: Float[np.ndarray, "time 3"]
-    """Centre of mass in the action frame [m]; the first row is the start that was given or estimated."""
-    pose_trajectory: Float[np.ndarray, "time 7"] | None = None
-    """Position of the centre of mass [m] and quaternion (w, x, y, z) of the rotation since rest, about the
-    action frame's axes: the identity at first. None if the predictor knows positions only."""
-    futures: Futures | None = None
-    """All that may happen, one row; the trajectories above are those of the most probable. None if the predictor
-    tells of one future only."""
-    warnings: tuple[str, ...] = ()
-    """In what the object is unlike those that the predictor has learned from, as far as it knows."""
-
-
-@dataclass(frozen=True)
-class ImaginedBatch:
-    """The effects that a predictor expects of many actions."""
-
-    times: Float[np.ndarray, " time"]
-    """Time of each sample [s], common to all."""
-    com: Float[np.ndarray, "batch time 3"]
-    """Centres of mass in the action frame [m]."""
-    pose: Float[np.ndarray, "batch time 7"] | None = None
-    """As ``ImaginedEffect.pose_trajectory``, one per interaction."""
-    futures: Futures | None = None
-    """As ``ImaginedEffect.futures``, one row per interaction."""
-    warnings: tuple[tuple[str, ...], ...] = ()
-    """As ``ImaginedEffect.warnings``, one per interaction; or none at all, where nobody looked."""
-
-    def __len__(self) -> int:
-        return len(self.com)
-
-    def __getitem__(self, index: int) -> ImaginedEffect:
-        pose = None if self.pose is None else self.pose[index]
-        futures = None if self.futures is None else self.futures[np.array([index])]
-        warnings = self.warnings[index] if self.warnings else ()
-        return ImaginedEffect(self.times, self.com[index], pose, futures, warnings)
+STARTS: tuple[Start, ...] = ("observed", "estimated")
 
 
 class EffectPredictor(nn.Module, ABC):

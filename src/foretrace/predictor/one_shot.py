@@ -13,23 +13,15 @@ from torch.nn import functional as F
 from foretrace.errors import TrainingError
 from foretrace.features import FeatureExtractor, Outline
 from foretrace.features.outline import HEIGHT_CELLS, MAX_CORNERS, UNIT
+from foretrace.imagined import LEVELS, Futures, ImaginedBatch, conformal_scores, quantiles_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
-from foretrace.predictor.base import EffectPredictor, ImaginedBatch, estimate_com
-from foretrace.predictor.futures import (
-    COORDINATES,
-    LEVELS,
-    TURN_LENGTH,
-    Futures,
-    Mixture,
-    along_hinges,
-    conformal_scores,
-    quantiles_of,
-)
-from foretrace.predictor.hinges import NUM_VALUES, PROBES, Hinges, find_hinges
-from foretrace.predictor.known import given_values
-from foretrace.predictor.members import MANY, Members
+from foretrace.predictor.base import EffectPredictor, estimate_com
+from foretrace.predictor.context import given_values
+from foretrace.predictor.ensemble import MANY, Members
+from foretrace.predictor.mixture import COORDINATES, TURN_LENGTH, Mixture, along_hinges
+from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, Hinges, find_hinges
 from foretrace.predictor.states import Effects, decode_poses
 
 ODD = (1, 3, 5)

@@ -22,14 +22,15 @@ from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import PREDICTORS, load_tensors, read_tensors, settings_of
+from foretrace.predictor.context import check_names, observed_values
 from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.domain import ranges_of
 from foretrace.predictor.files import write_tensors
-from foretrace.predictor.known import check_names, observed_values
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
+from foretrace.predictor.runtime import find_device, seeded, thread_count
 from foretrace.predictor.states import (
     Effects,
     StateKind,
@@ -37,7 +38,6 @@ from foretrace.predictor.states import (
     valid_lengths,
     valid_samples,
 )
-from foretrace.predictor.surroundings import find_device, seeded, thread_count
 from foretrace.trajectories import final_distance, mean_distance
 
 

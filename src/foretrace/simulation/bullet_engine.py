@@ -6,11 +6,12 @@ from jaxtyping import Float
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import SimulationError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix
+from foretrace.interactions.motions import GRAVITY, ContactParameters
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
+from foretrace.objects.body import Body
 from foretrace.simulation.bullet_world import World, connect
 from foretrace.simulation.engine import SPEED_LIMIT, STANDING_DEPTH, Motion, tip_transforms
-from foretrace.simulation.free_motion import GRAVITY, Body, Surroundings
 from foretrace.simulation.tool import TOUCH_MARGIN, Tool
 
 
@@ -104,14 +105,14 @@ def play_freely(
     body: Body,
     pose: Float[np.ndarray, " 7"],
     velocity: Float[np.ndarray, " 6"],
-    surroundings: Surroundings,
+    contact_parameters: ContactParameters,
     steps: int,
     timestep: float,
 ) -> tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]:
     """Poses and velocities of a free body, as `simulate_free_motion` describes them."""
-    world = World(timestep, surroundings.gravity)
-    world.add_table(surroundings.friction, surroundings.rolling_friction)
-    thing = world.add_object(body, pose_to_matrix(pose), surroundings.restitution or 0.0)
+    world = World(timestep, contact_parameters.gravity)
+    world.add_table(contact_parameters.friction, contact_parameters.rolling_friction)
+    thing = world.add_object(body, pose_to_matrix(pose), contact_parameters.restitution or 0.0)
     world.set_velocity(thing, velocity)
     poses, velocities = [], np.empty((steps + 1, 6))
     for i in range(steps + 1):

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 from foretrace.errors import SimulationError
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.objects import CollisionShape, CylinderShape, HullShape
-from foretrace.simulation.free_motion import Body
+from foretrace.objects.body import Body
 from foretrace.simulation.scene import TABLE_HEIGHT, TABLE_SIZE, TABLE_THICKNESS
 from foretrace.simulation.tool import Tool
 

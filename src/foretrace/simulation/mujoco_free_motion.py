@@ -9,9 +9,10 @@ from jaxtyping import Float
 from mujoco import rollout
 
 from foretrace.geometry import matrix_to_pose, quaternion_to_matrix
+from foretrace.interactions.motions import ContactParameters
 from foretrace.interactions.record import Physics
 from foretrace.objects import HullShape
-from foretrace.simulation.free_motion import Body, Surroundings
+from foretrace.objects.body import Body
 from foretrace.simulation.scene import build_scene
 from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, Tool
 
@@ -22,12 +23,12 @@ def play_freely(
     body: Body,
     pose: Float[np.ndarray, " 7"],
     velocity: Float[np.ndarray, " 6"],
-    surroundings: Surroundings,
+    contact_parameters: ContactParameters,
     steps: int,
     timestep: float,
 ) -> tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]:
     """Poses and velocities of a free body, as `simulate_free_motion` describes them."""
-    model = _compile(body, surroundings, timestep)
+    model = _compile(body, contact_parameters, timestep)
     data = mujoco.MjData(model)
     rotation, com = quaternion_to_matrix(pose[3:]), body.mass.com
     # The free joint is at the centre of mass, in the object's directions.
@@ -46,15 +47,15 @@ def play_freely(
     return np.hstack([positions, qpos[:, 3:]]), np.hstack([qvel[:, :3], spins])
 
 
-def _compile(body: Body, surroundings: Surroundings, timestep: float) -> mujoco.MjModel:
-    friction = [surroundings.friction, 0.005, surroundings.rolling_friction]
-    spec = build_scene(None, Physics(friction=surroundings.friction), Tool(), None, timestep)
-    spec.option.gravity = surroundings.gravity
+def _compile(body: Body, contact_parameters: ContactParameters, timestep: float) -> mujoco.MjModel:
+    friction = [contact_parameters.friction, 0.005, contact_parameters.rolling_friction]
+    spec = build_scene(None, Physics(friction=contact_parameters.friction), Tool(), None, timestep)
+    spec.option.gravity = contact_parameters.gravity
     table = spec.geom("table")
     table.friction = friction
     surface = {"friction": friction, "contype": OBJECT_BIT, "conaffinity": TABLE_BIT}
-    if surroundings.restitution is not None:
-        table.solref = surface["solref"] = _bouncing(surroundings.restitution, timestep)
+    if contact_parameters.restitution is not None:
+        table.solref = surface["solref"] = _bouncing(contact_parameters.restitution, timestep)
     part = spec.worldbody.add_body(name="object")
     part.add_freejoint()
     # Without a position MuJoCo drops the directions of the principal axes.
@@ -72,7 +73,7 @@ def _compile(body: Body, surroundings: Surroundings, timestep: float) -> mujoco.
                 pos=place[:3] - body.mass.com,
                 quat=place[3:],
                 size=[shape.radius, shape.length / 2, 0.0],
-                condim=6 if surroundings.rolling_friction > 0 else 3,
+                condim=6 if contact_parameters.rolling_friction > 0 else 3,
                 **surface,
             )
     return spec.compile()

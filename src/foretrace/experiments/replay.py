@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from foretrace.evaluation.recordings import Recording
 from foretrace.geometry import quaternion_to_matrix, rotation_angle
+from foretrace.interactions.motions import Recording
 from foretrace.simulation.free_motion import simulate_free_motion
 
 FACE_TOLERANCE = np.deg2rad(20.0)
@@ -92,7 +92,7 @@ def replay(recording: Recording, engine: str = "mujoco", timestep: float = TIMES
         start,
         float(recording.times[-1]),
         velocity=velocity,
-        surroundings=recording.surroundings,
+        contact_parameters=recording.contact_parameters,
         engine=engine,
         timestep=timestep,
     ).at(recording.times)

@@ -11,13 +11,13 @@ import pandas as pd
 import shapely
 
 from foretrace.errors import DatasetError, ForetraceError
-from foretrace.evaluation.stand_in import Observation
-from foretrace.evaluation.transfer import Transfer, check_sees, compare_played
-from foretrace.evaluation.transfer_objects import Played
+from foretrace.experiments.transfer import Transfer, check_sees, compare_played
+from foretrace.experiments.transfer_objects import Played
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
 from foretrace.predictor.base import EffectPredictor
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.stand_in import Observation
 
 
 def evaluate_recorded(predictor: EffectPredictor, dataset: Dataset) -> Transfer:

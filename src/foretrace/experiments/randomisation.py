@@ -21,22 +21,22 @@ from rich.console import Console
 from torch import Tensor
 
 from foretrace.errors import ResultsError
-from foretrace.evaluation.experiments import measure_errors
-from foretrace.evaluation.protocol import Recipe, load_levered
+from foretrace.evaluation.metrics import measure_errors
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_machine
 from foretrace.evaluation.runner import Failure, run_trials
-from foretrace.evaluation.stand_in import Observation, StandIn, hull_of
-from foretrace.evaluation.transfer import distance_until_slip
-from foretrace.evaluation.transfer_objects import Subject, everyday_objects, play, printed_shapes
+from foretrace.experiments.paper_protocol import Recipe, load_levered
+from foretrace.experiments.transfer import distance_until_slip
+from foretrace.experiments.transfer_objects import Subject, everyday_objects, play, printed_shapes
 from foretrace.features import FEATURES, make_features
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
 from foretrace.predictor import EffectPredictor, TrainConfig
-from foretrace.predictor.known import CONSTANTS, KNOWN, check_names, true_values
+from foretrace.predictor.context import CONSTANTS, KNOWN, check_names, true_values
 from foretrace.predictor.run_folder import fingerprint
-from foretrace.predictor.surroundings import thread_count
+from foretrace.predictor.runtime import thread_count
 from foretrace.predictor.training import fit_predictor
+from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 
 EXPERIMENT = "randomisation"
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"

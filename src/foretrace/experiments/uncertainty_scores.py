@@ -11,7 +11,7 @@ import scoringrules
 import torch
 from jaxtyping import Bool, Float
 
-from foretrace.predictor.futures import Mixture
+from foretrace.predictor.mixture import Mixture
 
 FORECASTS = {
     "mixture": "the predictor's futures",

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from foretrace.errors import TrainingError
-from foretrace.evaluation.experiments import STARTS
+from foretrace.imagined import LEVELS, conformal_scores
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
 from foretrace.predictor import EffectPredictor, load_predictor, part_of
+from foretrace.predictor.base import STARTS
 from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.domain import MEASURES, QUANTILES
-from foretrace.predictor.futures import LEVELS, conformal_scores
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance

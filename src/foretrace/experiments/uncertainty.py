@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from foretrace.errors import DatasetError
-from foretrace.evaluation.uncertainty_metrics import (
+from foretrace.experiments.uncertainty_metrics import (
     UNLIKE,
     Part,
     futures_of,
@@ -23,7 +23,7 @@ from foretrace.evaluation.uncertainty_metrics import (
     judge_outcomes,
     judge_regions,
 )
-from foretrace.evaluation.uncertainty_scores import constant_deviations, draw, score
+from foretrace.experiments.uncertainty_scores import constant_deviations, draw, score
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
 from foretrace.predictor import RECIPES, OneShotPredictor, TrainConfig, train_predictor

@@ -10,12 +10,12 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FormatStrFormatter
 from scipy.stats import betabinom
 
-from foretrace.evaluation.charts import BLUE, GRID, QUIET, REFERENCE, VERMILLION, finish, grid
-from foretrace.evaluation.figures import DPI, INK, OUTCOME_COLORS, STYLE
-from foretrace.evaluation.uncertainty_metrics import ALL, BEGINNINGS
-from foretrace.evaluation.uncertainty_report import WORDS
+from foretrace.experiments.charts import BLUE, GRID, QUIET, REFERENCE, VERMILLION, finish, grid
+from foretrace.experiments.uncertainty_metrics import ALL, BEGINNINGS
+from foretrace.experiments.uncertainty_report import WORDS
+from foretrace.imagined import LEVELS
 from foretrace.interactions.record import Outcome
-from foretrace.predictor.futures import LEVELS
+from foretrace.pictures.scene import DPI, INK, OUTCOME_COLORS, STYLE
 
 SPLIT_COLORS = {"shuffled": BLUE, "novel-shapes": VERMILLION}
 MARKERS = {ALL: "o", "levered": "s", "slipped": "^", "tumbled": "D", "rolled": "v", "missed": "P"}
@@ -27,7 +27,7 @@ def reliability_figure(rows: pd.DataFrame) -> Figure:
     """Share of motions within regions against their levels, a panel for each split.
 
     Args:
-        rows: As from `foretrace.evaluation.uncertainty.measure`, with ``seed`` and ``split``.
+        rows: As from `foretrace.experiments.uncertainty.measure`, with ``seed`` and ``split``.
     """
     splits = list(dict.fromkeys(rows["split"]))
     with mpl.rc_context(STYLE):

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from foretrace.evaluation.results import Metrics
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
+from foretrace.imagined import ImaginedBatch
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import EffectPredictor
-from foretrace.predictor.base import ImaginedBatch, Start
-from foretrace.predictor.known import observed_values
+from foretrace.predictor.base import STARTS
+from foretrace.predictor.context import observed_values
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance, rotation_error
 
-STARTS: tuple[Start, ...] = ("observed", "estimated")
 METRICS = {"full": mean_distance, "final": final_distance}
 
 

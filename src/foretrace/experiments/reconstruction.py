@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from foretrace.errors import PredictionError
-from foretrace.evaluation.figures import DPI, INK, STYLE
 from foretrace.features.autoencoder import AutoencoderFeatures
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.pictures.scene import DPI, INK, STYLE
 from foretrace.predictor import EffectPredictor
 
 Masks = Bool[np.ndarray, "batch 128 128"]

@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
-from foretrace.evaluation.figures import (
+from foretrace.experiments.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.experiments.transfer import Example
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
+from foretrace.pictures.scene import (
     ARROW_LENGTH,
     CM,
     DPI,
@@ -24,8 +26,6 @@ from foretrace.evaluation.figures import (
     STYLE,
     TOOL_COLOR,
 )
-from foretrace.evaluation.transfer import Example
-from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
 BARS = {"predicted": ("distance_predicted_cm", VERMILLION), "simulated": ("distance_simulated_cm", BLUE)}

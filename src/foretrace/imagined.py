@@ -1,16 +1,13 @@
-"""What may happen: several futures, each with its probability and how far the motion may be from it."""
+"""What an imaginer returns: the expected effect, and all futures with their probabilities and regions."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
-from torch.nn import functional as F
 
+from foretrace.geometry import rotation_vector_to_quaternion
 from foretrace.interactions.record import Outcome
-from foretrace.predictor.states import decode_poses
 
 LEVELS = np.arange(1, 100) / 100
 """Probabilities of the regions whose widths a predictor keeps."""
@@ -26,10 +23,6 @@ DRIFT = 2e-3
 """A change by this makes a future half as probable [m]."""
 FORGET_TIME = 0.3
 """An object that falls forgets within this time that it was not where it was expected [s]; it lands on the table."""
-COORDINATES = 6
-"""A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
-TURN_LENGTH = 0.05
-"""A turn by 1 rad weighs as much as a displacement by this [m]: about the distance from hinge to centre of mass."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +57,9 @@ class Futures:
     @cached_property
     def pose(self) -> Float[np.ndarray, "batch futures time 7"]:
         """As ``ImaginedEffect.pose_trajectory``; worked out when it is asked for."""
-        return decode_poses(self.states)
+        return np.concatenate(
+            [self.states[..., :3], rotation_vector_to_quaternion(self.states[..., 3:])], axis=-1
+        )
 
     @property
     def counted(self) -> np.ndarray:
@@ -153,81 +148,43 @@ def quantiles_of(scores: Float[np.ndarray, " n"]) -> Float[np.ndarray, " levels"
 
 
 @dataclass(frozen=True)
-class Mixture:
-    """Gaussian distributions of the weights of principal motions, one for each hinge and outcome."""
+class ImaginedEffect:
+    """The effect that a predictor expects of one action."""
 
-    com: Float[Tensor, "batch 3"]
-    """Centres of mass at rest in the action frame [m]."""
-    axes: Float[Tensor, "batch hinges 3 3"]
-    """Rows: the hinges' axes in the action frame."""
-    ends: Float[Tensor, "batch hinges 2 2"]
-    """Ends of the hinges [m]."""
-    odds: Float[Tensor, "batch hinges outcomes"]
-    """Logarithms of probabilities."""
-    mean: Float[Tensor, "batch hinges outcomes motions"]
-    """Expected weights."""
-    error: Float[Tensor, "batch hinges outcomes"]
-    """How large errors are expected to be."""
-    covariance: Float[Tensor, "outcomes motions motions"]
-    """Of weights, for errors of 1."""
-    motions: Float[Tensor, "motions time 6"]
-    """Principal motions along a hinge's axes [m]; turns times ``TURN_LENGTH``."""
-    mean_motion: Float[Tensor, "time 6"]
-    """What they are added to."""
-
-    def most_probable(self) -> Float[Tensor, "batch time 6"]:
-        """Positions [m] and rotation vectors [rad] of the most probable future of each."""
-        rows = torch.arange(len(self.com), device=self.com.device)
-        best = self.odds.flatten(1).argmax(dim=1)
-        weights, axes = self.mean.flatten(1, 2)[rows, best], self.axes[rows, best // self.odds.shape[2]]
-        return self._states(weights[:, None, None], axes[:, None])[:, 0]
-
-    def states(self) -> Float[Tensor, "batch futures time 6"]:
-        """Positions [m] and rotation vectors [rad] of all futures."""
-        return self._states(self.mean, self.axes)
-
-    def sample(self, num: int, generator: torch.Generator | None = None) -> Float[Tensor, "batch num time 6"]:
-        """Positions [m] and rotation vectors [rad] drawn at random."""
-        rows = torch.arange(len(self.com), device=self.com.device)[:, None]
-        chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
-        z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
-        root, error = torch.linalg.cholesky(self.covariance), self.error.flatten(1)[rows, chosen]
-        off = error[..., None] * (root[chosen % len(root)] @ z[..., None])[..., 0]
-        weights = self.mean.flatten(1, 2)[rows, chosen] + off
-        return self._states(weights[:, :, None], self.axes[rows, chosen // self.odds.shape[2]])
-
-    def spread(self) -> Float[Tensor, "batch futures time"]:
-        """Root mean square of the distance from each future's positions [m]."""
-        displaced = self.motions[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, motions)
-        variance = ((displaced @ self.covariance) * displaced).sum(dim=-1)
-        at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()  # (outcomes, time)
-        return (self.error[..., None] * at_error_1).flatten(1, 2)
-
-    def _states(
-        self,
-        weights: Float[Tensor, "batch hinges futures motions"],
-        axes: Float[Tensor, "batch hinges 3 3"],
-    ) -> Float[Tensor, "batch hinges*futures time 6"]:
-        shape = (*weights.shape[:3], 2, 3)  # displacements and turns
-        motion = torch.addmm(self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.motions.mT.flatten(1))
-        back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)
-        rest = F.pad(self.com, (0, 3)).unflatten(1, (2, 3))[:, None, None].expand(shape)
-        # One product with time last: memory is gone through once, in long rows.
-        states = torch.baddbmm(
-            rest.flatten(0, 3)[..., None], back.flatten(0, 3), motion.unflatten(1, (2, 3, -1)).flatten(0, 1)
-        )
-        return states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
+    times: Float[np.ndarray, " time"]
+    """Time of each sample [s], from the moment before the blade touches the object."""
+    com_trajectory: Float[np.ndarray, "time 3"]
+    """Centre of mass in the action frame [m]; the first row is the start that was given or estimated."""
+    pose_trajectory: Float[np.ndarray, "time 7"] | None = None
+    """Position of the centre of mass [m] and quaternion (w, x, y, z) of the rotation since rest, about the
+    action frame's axes: the identity at first. None if the predictor knows positions only."""
+    futures: Futures | None = None
+    """All that may happen, one row; the trajectories above are those of the most probable. None if the predictor
+    tells of one future only."""
+    warnings: tuple[str, ...] = ()
+    """In what the object is unlike those that the predictor has learned from, as far as it knows."""
 
 
-def along_hinges(
-    axes: Float[Tensor, "batch *hinges 3 3"], motion: Float[Tensor, "batch time 6"]
-) -> Float[Tensor, "batch *hinges time 6"]:
-    """Displacements and turns in the action frame along hinges' axes.
+@dataclass(frozen=True)
+class ImaginedBatch:
+    """The effects that a predictor expects of many actions."""
 
-    A turn seen along left-handed axes, those of a mirror image, goes the other way round.
-    """
-    extra = (1,) * (axes.dim() - 3)
-    moved, turned = (
-        part.view(len(part), *extra, *part.shape[1:]) @ axes.mT for part in motion.split(3, dim=-1)
-    )
-    return torch.cat([moved, torch.linalg.det(axes)[..., None, None] * turned], dim=-1)
+    times: Float[np.ndarray, " time"]
+    """Time of each sample [s], common to all."""
+    com: Float[np.ndarray, "batch time 3"]
+    """Centres of mass in the action frame [m]."""
+    pose: Float[np.ndarray, "batch time 7"] | None = None
+    """As ``ImaginedEffect.pose_trajectory``, one per interaction."""
+    futures: Futures | None = None
+    """As ``ImaginedEffect.futures``, one row per interaction."""
+    warnings: tuple[tuple[str, ...], ...] = ()
+    """As ``ImaginedEffect.warnings``, one per interaction; or none at all, where nobody looked."""
+
+    def __len__(self) -> int:
+        return len(self.com)
+
+    def __getitem__(self, index: int) -> ImaginedEffect:
+        pose = None if self.pose is None else self.pose[index]
+        futures = None if self.futures is None else self.futures[np.array([index])]
+        warnings = self.warnings[index] if self.warnings else ()
+        return ImaginedEffect(self.times, self.com[index], pose, futures, warnings)

@@ -15,11 +15,11 @@ from rich.console import Console
 from torch import Tensor
 
 from foretrace.errors import ResultsError
-from foretrace.evaluation.comparisons import ABLATIONS, EXPERIMENTS, ONE_SHOT, plan, shuffled, split_of
-from foretrace.evaluation.experiments import measure_errors
+from foretrace.evaluation.metrics import measure_errors
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_machine, finished_trials
 from foretrace.evaluation.runner import Failure, run_trials
-from foretrace.evaluation.support import support_point_metrics
+from foretrace.experiments.paper_trials import ABLATIONS, EXPERIMENTS, ONE_SHOT, plan, shuffled, split_of
+from foretrace.experiments.support import support_point_metrics
 from foretrace.features import Option, make_features
 from foretrace.features.base import fast_precision
 from foretrace.interactions.dataset import Dataset, InteractionBatch
@@ -28,8 +28,8 @@ from foretrace.interactions.splits import PAPER_SIZES, Split
 from foretrace.predictor import RECIPES, TrainConfig
 from foretrace.predictor.checkpoint import settings_of
 from foretrace.predictor.run_folder import fingerprint
+from foretrace.predictor.runtime import find_device, thread_count
 from foretrace.predictor.states import valid_lengths
-from foretrace.predictor.surroundings import find_device, thread_count
 from foretrace.predictor.training import fit_predictor
 
 FITTED = "fitted"

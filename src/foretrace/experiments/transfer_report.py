@@ -51,7 +51,7 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     """Everything that the tables tell, JSON-able.
 
     Args:
-        rows: As in `foretrace.evaluation.transfer.Transfer`.
+        rows: As in `foretrace.experiments.transfer.Transfer`.
 
     Returns:
         ``edges``: one entry for each edge of a printed or recorded shape; ``objects``: one for each other object;

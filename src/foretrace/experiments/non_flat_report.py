@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
-from foretrace.evaluation.figures import DPI, INK, STYLE
-from foretrace.evaluation.non_flat_errors import CHANNELS, KINDS, SETTINGS
 from foretrace.evaluation.statistics import mean_interval
+from foretrace.experiments.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.experiments.non_flat_errors import CHANNELS, KINDS, SETTINGS
+from foretrace.pictures.scene import DPI, INK, STYLE
 
 PAPER = {"mask": 7.23, "height": 2.77}
 """Full-trajectory errors over the paper's whole set [cm] (section 5.5)."""
@@ -35,8 +35,8 @@ def summarise(errors: pd.DataFrame, floors: pd.DataFrame) -> dict[str, Any]:
     """Everything that tables and pictures tell, JSON-able.
 
     Args:
-        errors: As from `foretrace.evaluation.non_flat_errors.measure`, with ``seed``, ``setting`` and ``channel``.
-        floors: As from `foretrace.evaluation.non_flat_errors.spread_of_fates`; may be empty.
+        errors: As from `foretrace.experiments.non_flat_errors.measure`, with ``seed``, ``setting`` and ``channel``.
+        floors: As from `foretrace.experiments.non_flat_errors.spread_of_fates`; may be empty.
 
     Returns:
         ``settings``: by setting, for each group the errors of both channels [cm] and the ratio of height map to mask,
@@ -204,7 +204,7 @@ def paths_figure(paths: pd.DataFrame) -> Figure:
     """Observed and imagined paths of objects that look alike, from the side (paper, figure 16, right).
 
     Args:
-        paths: As from `foretrace.evaluation.non_flat_errors.example_paths`, of at least one object.
+        paths: As from `foretrace.experiments.non_flat_errors.example_paths`, of at least one object.
     """
     kinds = list(dict.fromkeys(paths["kind"]))
     with mpl.rc_context(STYLE):

@@ -19,11 +19,11 @@ from matplotlib.patches import Patch
 
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, PredictionError
-from foretrace.evaluation.tubes import Outlook
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
 from foretrace.objects import ObjectModel
+from foretrace.pictures.tubes import Outlook
 
 INK = "#22262e"
 GREY = "#8b93a1"

@@ -19,12 +19,12 @@ import shapely
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, ShapeError
-from foretrace.evaluation.stand_in import Observation, StandIn
 from foretrace.geometry import convex_hull, inward_normals
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.objects import CIRCLE_RADIUS, Prism, read_silhouette
 from foretrace.objects.model import fitting_bevel
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.stand_in import Observation, StandIn
 
 Group = Literal["printed", "everyday", "silhouettes", "prisms"]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

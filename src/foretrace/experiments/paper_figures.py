@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from foretrace.evaluation.charts import (
+from foretrace.experiments.charts import (
     GRID,
     LOOKS,
     draw_boxes,
@@ -28,7 +28,7 @@ from foretrace.evaluation.charts import (
     rows_of,
     seeds_in_words,
 )
-from foretrace.evaluation.claims import (
+from foretrace.experiments.claims import (
     AUTOENCODERS,
     PAIRS,
     SHAPE_CONTEXTS,
@@ -36,7 +36,7 @@ from foretrace.evaluation.claims import (
     SUPERVISED,
     TASK_SPECIFIC,
 )
-from foretrace.evaluation.figures import DPI, INK, STYLE
+from foretrace.pictures.scene import DPI, INK, STYLE
 
 PANELS = {
     "Shape context": SHAPE_CONTEXTS,

@@ -11,7 +11,9 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MultipleLocator
 
 from foretrace.errors import DatasetError
-from foretrace.evaluation.figures import (
+from foretrace.interactions.record import Interaction
+from foretrace.interactions.topdown import TopDownView
+from foretrace.pictures.scene import (
     ARROW_LENGTH,
     CM,
     DPI,
@@ -24,8 +26,6 @@ from foretrace.evaluation.figures import (
     silhouette,
     tool_line,
 )
-from foretrace.interactions.record import Interaction
-from foretrace.interactions.topdown import TopDownView
 
 MARGIN = 0.02
 """Table shown around the objects [m]."""

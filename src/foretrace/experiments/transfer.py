@@ -19,13 +19,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from foretrace.errors import PredictionError, ShapeError, SimulationError
-from foretrace.evaluation.stand_in import Observation, StandIn, hull_of
-from foretrace.evaluation.transfer_objects import Played, Subject, play
+from foretrace.experiments.transfer_objects import Played, Subject, play
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.known import true_values
+from foretrace.predictor.context import true_values
 from foretrace.simulation.collect import ctrl_c_later
+from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 from foretrace.trajectories import warped_distance
 
 CM = 100.0

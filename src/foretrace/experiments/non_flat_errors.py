@@ -21,7 +21,7 @@ import pandas as pd
 from jaxtyping import Int
 
 from foretrace.errors import DatasetError
-from foretrace.evaluation.experiments import METRICS
+from foretrace.evaluation.metrics import METRICS
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split, split_by_object, split_by_seed
 from foretrace.objects import ObjectModel, object_from_dict

@@ -14,9 +14,9 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from foretrace.evaluation.claims import SUPERVISED, TASK_SPECIFIC, UNSUPERVISED
-from foretrace.evaluation.figures import GREY, INK
 from foretrace.evaluation.statistics import mean_interval
+from foretrace.experiments.claims import SUPERVISED, TASK_SPECIFIC, UNSUPERVISED
+from foretrace.pictures.scene import GREY, INK
 
 
 class Look(NamedTuple):

@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foretrace.evaluation.experiments import METRICS
+from foretrace.evaluation.metrics import METRICS
+from foretrace.imagined import LEVELS
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import Futures, ImaginedBatch, OneShotPredictor
-from foretrace.predictor.futures import LEVELS, Mixture
-from foretrace.predictor.known import observed_values
+from foretrace.predictor.context import observed_values
+from foretrace.predictor.mixture import Mixture
 from foretrace.predictor.states import decode_poses, encode_states
 from foretrace.trajectories import mean_distance, rotation_error
 

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 from foretrace.evaluation.statistics import mean_interval
-from foretrace.evaluation.uncertainty_metrics import ALL, BEGINNINGS, OBSERVED, SHOWN_LEVELS, UNLIKE
-from foretrace.evaluation.uncertainty_scores import FORECASTS, SCORES
+from foretrace.experiments.uncertainty_metrics import ALL, BEGINNINGS, OBSERVED, SHOWN_LEVELS, UNLIKE
+from foretrace.experiments.uncertainty_scores import FORECASTS, SCORES
 from foretrace.predictor.one_shot import FEW
 
 PARTS = ("train", "validation", "test")
@@ -39,7 +39,7 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     """Means over the seeds and their 95 % bootstrap intervals, JSON-able.
 
     Args:
-        rows: As from `foretrace.evaluation.uncertainty.measure`, with ``seed`` and ``split``.
+        rows: As from `foretrace.experiments.uncertainty.measure`, with ``seed`` and ``split``.
 
     Returns:
         By split: ``seeds``; ``values``, by metric, group and, if there are any, level; ``few``: outcomes of which some

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, ORANGE, finish, grid, seeds_in_words
-from foretrace.evaluation.figures import DPI, GREY, INK, STYLE
-from foretrace.evaluation.randomisation import KNOWING, PLAIN, VARIED
 from foretrace.evaluation.statistics import mean_interval
+from foretrace.experiments.charts import BLUE, GREEN, ORANGE, finish, grid, seeds_in_words
+from foretrace.experiments.randomisation import KNOWING, PLAIN, VARIED
+from foretrace.pictures.scene import DPI, GREY, INK, STYLE
 
 JUDGES = {
     "plain test": "plain_full",

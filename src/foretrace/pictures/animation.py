@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from foretrace.errors import PredictionError
-from foretrace.evaluation import figures
-from foretrace.evaluation.figures import CM, STYLE, TOOL_REACH, Scene
 from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject
 from foretrace.objects.surface import faces_of
+from foretrace.pictures import scene as figures
+from foretrace.pictures.scene import CM, STYLE, TOOL_REACH, Scene
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)
 """Where the camera stands: turned from the action's direction towards its right, and raised."""

@@ -1,0 +1,193 @@
+"""Files that are either whole or absent, JSON with a format and a version, folders with one writer."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from foretrace.errors import ForetraceError
+
+LOCK = ".lock"
+PARTIAL = ".partial"
+"""Ending of a file that is being written; what has it is the rest of an interrupted run."""
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A name to write to; the file gets its own name at the end of the block, or is removed after an error.
+
+    Every process has a name of its own, so that several may write the same file at once: the last one stays.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
+    try:
+        yield partial
+        with open(partial, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    if os.name == "posix":  # the new name itself must reach the disk, too
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that it is either whole or absent, even after a loss of power."""
+    with atomic_path(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file atomically."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, content: Any, indent: int = 1) -> None:
+    """Write a JSON file atomically."""
+    write_text(path, json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
+
+
+def read_json(path: Path, error: type[ForetraceError], remedy: str) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Args:
+        path: The file.
+        error: The class to raise.
+        remedy: What to do about a file that cannot be read; ends the message.
+
+    Raises:
+        ForetraceError: Of the given class: the file is missing, is not UTF-8 or JSON, or holds no object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise error(f"{path} does not exist: {remedy}") from None
+    except OSError as reason:
+        raise error(f"{path} cannot be read ({reason.strerror}): {remedy}") from reason
+    except (ValueError, RecursionError) as reason:
+        raise error(f"{path} cannot be read as JSON ({reason}): {remedy}") from reason
+    if not isinstance(content, dict):
+        raise error(f"{path} holds a {type(content).__name__} where a JSON object is expected: {remedy}")
+    return content
+
+
+def read_versioned(
+    path: Path,
+    format: str,
+    version: int,
+    error: type[ForetraceError],
+    remedy: str,
+    key: str = "format_version",
+    older: tuple[int, ...] = (),
+) -> dict[str, Any]:
+    """The object in a JSON file that names its format and version.
+
+    Args:
+        path: The file.
+        format: Name that its entry ``format`` must have.
+        version: Version that is written today.
+        error: The class to raise.
+        remedy: What to do about a file that cannot be read; ends the message.
+        key: Entry that holds the version.
+        older: Older versions that can be read as well.
+
+    Raises:
+        ForetraceError: Of the given class: as `read_json`, or the format or its version is another one.
+    """
+    content = read_json(path, error, remedy)
+    if content.get("format") != format:
+        raise error(f"{path} does not describe a {format}: {remedy}")
+    if content.get(key) not in (version, *older):
+        raise error(
+            f"{path} has format version {content.get(key)!r}, this foretrace reads version {version}: "
+            f"use the foretrace that wrote it, or {remedy}"
+        )
+    return content
+
+
+@contextmanager
+def sole_writer(folder: Path, error: type[ForetraceError] = ForetraceError) -> Iterator[None]:
+    """Hold a folder's lock, which the system releases even when the process is killed.
+
+    Args:
+        folder: The folder; it must exist.
+        error: The class to raise.
+
+    Raises:
+        ForetraceError: Of the given class: another process is writing there.
+    """
+    with open(folder / LOCK, "w") as lock:
+        if os.name == "posix":
+            import fcntl
+
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as reason:
+                raise error(f"another foretrace writes to {folder}; wait until it is done") from reason
+        yield
+
+
+def remove_partial(folder: Path) -> list[Path]:
+    """Remove what interrupted writes left in a folder; returns what was removed."""
+    leftovers = partial_files(folder)
+    for file in leftovers:
+        file.unlink(missing_ok=True)
+    return leftovers
+
+
+def partial_files(folder: Path) -> list[Path]:
+    """Files that interrupted writes left in a folder, in order of their names."""
+    return sorted(file for file in folder.glob(f"*{PARTIAL}") if file.is_file())
+
+
+def flatten(nested: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings on one level, names joined by dots."""
+    flat: dict[str, Any] = {}
+    for name, value in nested.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def first_difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+    """Name, value found and value wanted of the first setting, by name, in which two configurations differ."""
+    flat_found, flat_wanted = flatten(found), flatten(wanted)
+    for name in sorted(flat_found.keys() | flat_wanted.keys()):
+        if flat_found.get(name) != flat_wanted.get(name):
+            return name, flat_found.get(name), flat_wanted.get(name)
+    return None
+
+
+def as_json(content: Any) -> Any:
+    """What a JSON file gives back of something: tuples are lists, keys are strings."""
+    return json.loads(json.dumps(content))
+
+
+def short_hash(*parts: bytes) -> str:
+    """First 16 hexadecimal digits of a SHA-256 checksum."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()[:16]
+
+
+@lru_cache(maxsize=16)
+def versions_of(*distributions: str) -> dict[str, str]:
+    """Installed versions of distributions; ``not installed`` where one is missing."""
+    found = {}
+    for name in distributions:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

@@ -1,0 +1,1 @@
+"""Pictures and animations of interactions and of imagined effects."""

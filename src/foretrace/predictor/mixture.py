@@ -1,0 +1,94 @@
+"""The distribution over motions that the networks of the direct predictor describe."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+COORDINATES = 6
+"""A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
+TURN_LENGTH = 0.05
+"""A turn by 1 rad weighs as much as a displacement by this [m]: about the distance from hinge to centre of mass."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Gaussian distributions of the weights of principal motions, one for each hinge and outcome."""
+
+    com: Float[Tensor, "batch 3"]
+    """Centres of mass at rest in the action frame [m]."""
+    axes: Float[Tensor, "batch hinges 3 3"]
+    """Rows: the hinges' axes in the action frame."""
+    ends: Float[Tensor, "batch hinges 2 2"]
+    """Ends of the hinges [m]."""
+    odds: Float[Tensor, "batch hinges outcomes"]
+    """Logarithms of probabilities."""
+    mean: Float[Tensor, "batch hinges outcomes motions"]
+    """Expected weights."""
+    error: Float[Tensor, "batch hinges outcomes"]
+    """How large errors are expected to be."""
+    covariance: Float[Tensor, "outcomes motions motions"]
+    """Of weights, for errors of 1."""
+    motions: Float[Tensor, "motions time 6"]
+    """Principal motions along a hinge's axes [m]; turns times ``TURN_LENGTH``."""
+    mean_motion: Float[Tensor, "time 6"]
+    """What they are added to."""
+
+    def most_probable(self) -> Float[Tensor, "batch time 6"]:
+        """Positions [m] and rotation vectors [rad] of the most probable future of each."""
+        rows = torch.arange(len(self.com), device=self.com.device)
+        best = self.odds.flatten(1).argmax(dim=1)
+        weights, axes = self.mean.flatten(1, 2)[rows, best], self.axes[rows, best // self.odds.shape[2]]
+        return self._states(weights[:, None, None], axes[:, None])[:, 0]
+
+    def states(self) -> Float[Tensor, "batch futures time 6"]:
+        """Positions [m] and rotation vectors [rad] of all futures."""
+        return self._states(self.mean, self.axes)
+
+    def sample(self, num: int, generator: torch.Generator | None = None) -> Float[Tensor, "batch num time 6"]:
+        """Positions [m] and rotation vectors [rad] drawn at random."""
+        rows = torch.arange(len(self.com), device=self.com.device)[:, None]
+        chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
+        z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
+        root, error = torch.linalg.cholesky(self.covariance), self.error.flatten(1)[rows, chosen]
+        off = error[..., None] * (root[chosen % len(root)] @ z[..., None])[..., 0]
+        weights = self.mean.flatten(1, 2)[rows, chosen] + off
+        return self._states(weights[:, :, None], self.axes[rows, chosen // self.odds.shape[2]])
+
+    def spread(self) -> Float[Tensor, "batch futures time"]:
+        """Root mean square of the distance from each future's positions [m]."""
+        displaced = self.motions[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, motions)
+        variance = ((displaced @ self.covariance) * displaced).sum(dim=-1)
+        at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()  # (outcomes, time)
+        return (self.error[..., None] * at_error_1).flatten(1, 2)
+
+    def _states(
+        self,
+        weights: Float[Tensor, "batch hinges futures motions"],
+        axes: Float[Tensor, "batch hinges 3 3"],
+    ) -> Float[Tensor, "batch hinges*futures time 6"]:
+        shape = (*weights.shape[:3], 2, 3)  # displacements and turns
+        motion = torch.addmm(self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.motions.mT.flatten(1))
+        back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)
+        rest = F.pad(self.com, (0, 3)).unflatten(1, (2, 3))[:, None, None].expand(shape)
+        # One product with time last: memory is gone through once, in long rows.
+        states = torch.baddbmm(
+            rest.flatten(0, 3)[..., None], back.flatten(0, 3), motion.unflatten(1, (2, 3, -1)).flatten(0, 1)
+        )
+        return states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
+
+
+def along_hinges(
+    axes: Float[Tensor, "batch *hinges 3 3"], motion: Float[Tensor, "batch time 6"]
+) -> Float[Tensor, "batch *hinges time 6"]:
+    """Displacements and turns in the action frame along hinges' axes.
+
+    A turn seen along left-handed axes, those of a mirror image, goes the other way round.
+    """
+    extra = (1,) * (axes.dim() - 3)
+    moved, turned = (
+        part.view(len(part), *extra, *part.shape[1:]) @ axes.mT for part in motion.split(3, dim=-1)
+    )
+    return torch.cat([moved, torch.linalg.det(axes)[..., None, None] * turned], dim=-1)

@@ -1,0 +1,167 @@
+"""The one way to run many jobs: local processes, progress on the console, Ctrl-C, workers that are killed."""
+
+import os
+import signal
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from multiprocessing import resource_tracker
+from typing import Any, TypeVar, cast
+
+from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from foretrace.errors import ForetraceError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+MOST_WORKERS = 1024
+PLAIN_REPORT_PERIOD = 10.0
+"""Seconds between two lines of progress where there is no terminal."""
+
+
+def count_workers(workers: int | None, error: type[ForetraceError]) -> int:
+    """Number of processes: by default one for each core.
+
+    Raises:
+        ForetraceError: Of the given class: the number is out of range.
+    """
+    if workers is None:
+        return cpu_count()
+    if not 1 <= workers <= MOST_WORKERS:
+        raise error(f"workers is {workers}: give a number from 1 to {MOST_WORKERS}")
+    return workers
+
+
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    workers: int,
+    *,
+    error: type[ForetraceError],
+    threads: int = 1,
+    ordered: bool = False,
+    ahead: str = "2*n_jobs",
+) -> Generator[Result, None, None]:
+    """Results of a function over many jobs, each as soon as it is there.
+
+    The processes never hear Ctrl-C: this one stops them. They end by themselves when this one is killed.
+
+    Args:
+        function: Runs one job in any process: a function or a picklable object, whose result depends on the job alone.
+        jobs: The jobs, begun in this order.
+        workers: Processes; with one, the work is done in this process.
+        error: Class to raise when a process is killed.
+        threads: Threads of numerical libraries in each process.
+        ordered: Whether results come in the order of the jobs; otherwise, in the order in which they are finished.
+        ahead: How many jobs are handed out before they are needed, as joblib's ``pre_dispatch``.
+
+    Raises:
+        ForetraceError: Of the given class: a process was killed; or any that the function raises.
+    """
+    with (
+        parallel_config("loky", n_jobs=max(1, min(workers, len(jobs))), inner_max_num_threads=threads),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", message=".*still being processed by the workers")  # after Ctrl-C
+        order = "generator" if ordered else "generator_unordered"
+        # One at a time: joblib would hand over short jobs in batches, and hold results back until a batch is done.
+        parallel = Parallel(return_as=order, batch_size=1, pre_dispatch=ahead)  # pyright: ignore[reportArgumentType]
+        calls = (delayed(_run)(function, job, os.getpid()) for job in jobs)
+        try:
+            with _ctrl_c_later():
+                results = cast(Generator[Result, None, None], parallel(calls))
+            with closing(results):
+                yield from results
+        except TerminatedWorkerError as reason:
+            raise error(
+                "a worker process was killed, perhaps for lack of memory; finished work is kept: "
+                f"repeat the command with fewer workers than {workers}"
+            ) from reason
+
+
+def _run(function: Callable[[Job], Result], job: Job, parent: int) -> Result:
+    """One job, in a worker or (with one worker) in the parent itself."""
+    if os.getpid() != parent:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+        if os.getppid() != parent:
+            os._exit(1)  # the parent was killed: nothing waits for this result
+    return function(job)
+
+
+@contextmanager
+def _ctrl_c_later() -> Iterator[None]:
+    """Ctrl-C waits while workers start: they inherit the mask, and so never hear it, not even as they start."""
+    if os.name != "posix":
+        yield
+        return
+    resource_tracker.ensure_running()  # which would let Ctrl-C through again, were it started later
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class ProgressReport:
+    """Progress on the console: a bar on a terminal, a line now and then elsewhere. A context manager.
+
+    Args:
+        noun: What is counted, in the plural: ``interactions``.
+        total: How many there are in all.
+        done: How many were finished before.
+        console: Where to report; standard error by default.
+        period: Seconds between two lines where there is no terminal; 0 for a line each.
+    """
+
+    def __init__(
+        self,
+        noun: str,
+        total: int,
+        done: int = 0,
+        console: Console | None = None,
+        period: float = PLAIN_REPORT_PERIOD,
+    ):
+        self.console = console or Console(stderr=True)
+        self._noun, self._total, self._before, self._done = noun, total, done, done
+        self._period, self._begun = period, time.monotonic()
+        self._last_line = self._begun
+        self._bar = Progress(
+            MofNCompleteColumn(),
+            BarColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+            console=self.console,
+            disable=not self.console.is_terminal,
+            speed_estimate_period=24 * 3600,  # one job may take longer than the default of half a minute
+        )
+        self._task = self._bar.add_task("", total=total, completed=done)
+
+    def __enter__(self) -> "ProgressReport":
+        self._bar.start()
+        if self._before:
+            self.say(f"{self._before} of {self._total} {self._noun} are there already")
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self._bar.stop()
+
+    def add(self, count: int = 1, text: str = "") -> None:
+        """Count finished jobs, with a word on the last one or on all of them."""
+        self._done += count
+        now = time.monotonic()
+        rate = (self._done - self._before) / max(now - self._begun, 1e-9)
+        speed = f"{rate:.1f}/s" if rate >= 0.1 else f"{60 * rate:.1f}/min"
+        self._bar.update(self._task, completed=self._done, description=f"{speed}  {text}")
+        if not self.console.is_terminal and now - self._last_line >= self._period:
+            self._last_line = now
+            left = f", {(self._total - self._done) / rate:.0f} s left" if self._period and rate else ""
+            self.say(f"{self._done} of {self._total} {self._noun}, {speed}{left}: {text}".rstrip(": "))
+
+    def say(self, line: str) -> None:
+        """Print a line beside the bar."""
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
