@@ -12,7 +12,7 @@ from foretrace.errors import DatasetError
 from foretrace.experiments.transfer_recorded import levered_edge
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.recorded import NOTES_FOLDER, read_notes
-from foretrace.perception.films import open_film
+from foretrace.perception.recordings import open_recording
 from foretrace.predictor import TrainConfig, load_predictor, train_predictor
 from foretrace.trajectories import mean_distance
 
@@ -56,7 +56,7 @@ def test_films_of_a_data_set_come_back_as_they_were(simulated: Path, recorded: P
         np.testing.assert_allclose(np.diff(effect.times), 0.05, atol=1e-9)  # filmed 10 times a second
         n = len(effect.times)
         assert mean_distance(effect.com_trajectory, truth.com_trajectory[:n]) < 0.004
-    film = open_film(simulated.parent / "film-0")
+    film = open_recording(simulated.parent / "film-0")
     assert film.camera is not None
     assert [frame.depth is not None for frame in film.frames()][:2] == [True, False]
 
@@ -73,10 +73,13 @@ def test_recordings_are_learned_from_and_judged_like_simulations(
     pytest.importorskip("imageio_ffmpeg")
     video = tmp_path / "overlay.mp4"
     assert main(["overlay", str(recorded), "0", "--run", str(tmp_path / "run"), "--out", str(video)]) == 0
-    shown, film = list(open_film(video).frames()), list(open_film(recorded.parent / "film-0").frames())
+    shown, film = (
+        list(open_recording(video).frames()),
+        list(open_recording(recorded.parent / "film-0").frames()),
+    )
     assert len(shown) == len(film)
     assert (tmp_path / "overlay-side.png").stat().st_size > 1000
-    changed = np.abs(shown[-1].picture.astype(int) - film[-1].picture).max(axis=2) > 80
+    changed = np.abs(shown[-1].image.astype(int) - film[-1].image).max(axis=2) > 80
     assert 100 < changed.sum() < 0.1 * changed.size
     assert main(["overlay", str(recorded), "9", "--out", str(video)]) == 2
     assert "has no recording 9" in capsys.readouterr().err

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from foretrace.errors import RobotError
-from foretrace.interactions.film_folder import FilmNotes
+from foretrace.interactions.recording_folder import RecordingNotes
 from foretrace.robot.checks import ArmLimits
-from foretrace.robot.execution import SETTLE, Recording, WatchConfig, execute
-from foretrace.robot.filming import Filming
+from foretrace.robot.execution import SETTLE, MotionLog, WatchConfig, execute
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath
+from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD
 from foretrace.simulation.tool import Tool
 from ur_controller import RunningController
@@ -95,14 +95,14 @@ def test_the_way_back_follows_and_is_recorded(kinematics, recording):
 
 
 class PacedCamera:
-    """A video file that gives its pictures at the pace of a camera, over and over."""
+    """A video file that gives its images at the pace of a camera, over and over."""
 
     def __init__(self, file: Path) -> None:
-        self._picture = cv2.VideoCapture(str(file)).read()[1]
+        self._image = cv2.VideoCapture(str(file)).read()[1]
 
     def read(self) -> tuple[bool, np.ndarray]:
         time.sleep(1 / 30)
-        return True, self._picture
+        return True, self._image
 
     def release(self) -> None:
         pass
@@ -120,7 +120,7 @@ def video(tmp_path) -> Path:
 
 def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording, video, monkeypatch):
     folder = recording.parent / "film"
-    film = Filming(str(video), folder)
+    film = VideoRecorder(str(video), folder)
     monkeypatch.setattr(film, "_capture", PacedCamera(video))
     with RunningController(START) as controller:
         go(controller.host, kinematics, recording, film=film, legs=(LEG, BACK))
@@ -134,20 +134,23 @@ def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording,
     last, first = (
         [float(row["host_s"]) for row in rows if row["leg"] == leg] for leg in ("approach", "lever-up")
     )
-    start = FilmNotes.load(folder).action_start
+    start = RecordingNotes.load(folder).action_start
     assert start is not None
     assert last[-1] - 1e-4 < start < first[0] + 1e-4
 
 
 def test_a_camera_that_ends_early_is_told(video, tmp_path):
-    with pytest.warns(UserWarning, match="no more pictures"), Filming(str(video), tmp_path / "film") as film:
+    with (
+        pytest.warns(UserWarning, match="no more images"),
+        VideoRecorder(str(video), tmp_path / "film") as film,
+    ):
         film._thread.join(60)
     assert len((tmp_path / "film" / "timestamps.csv").read_text().splitlines()) == 2
 
 
 def test_a_camera_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(RobotError, match=r"camera \S+none\.avi gives no picture"):
-        Filming(str(tmp_path / "none.avi"), tmp_path / "film")
+    with pytest.raises(RobotError, match=r"camera \S+none\.avi gives no image"):
+        VideoRecorder(str(tmp_path / "none.avi"), tmp_path / "film")
 
 
 @pytest.mark.parametrize(
@@ -212,5 +215,5 @@ def test_a_controller_that_is_not_there_is_named(kinematics, recording):
 def test_an_older_recording_is_not_overwritten(recording):
     recording.write_text("mine")
     with pytest.raises(RobotError, match="is there already"):
-        Recording(recording)
+        MotionLog(recording)
     assert recording.read_text() == "mine"

@@ -8,7 +8,7 @@ from foretrace.cli.console import say
 
 
 def calibrate(
-    pictures: Positional[tuple[Path, ...]] = (),
+    images: Positional[tuple[Path, ...]] = (),
     squares: tuple[int, int] = (7, 5),
     square_length: float = 0.035,
     marker_length: float = 0.026,
@@ -16,10 +16,10 @@ def calibrate(
     out: Path = Path("camera.json"),
     print_board: Path | None = None,
 ) -> None:
-    """Calibrate a camera from pictures of a ChArUco board, or write the board for printing.
+    """Calibrate a camera from images of a ChArUco board, or write the board for printing.
 
     Args:
-        pictures: Pictures or folders of pictures: 10 to 20 of the board, slanted, near and far, also in the corners.
+        images: Images or folders of images: 10 to 20 of the board, slanted, near and far, also in the corners.
         squares: Squares of the board along x and y.
         square_length: Side of a square, measured on the print [m].
         marker_length: Side of a marker [m].
@@ -28,7 +28,7 @@ def calibrate(
         print_board: Write the board to this .png or .pdf file instead.
     """
     from foretrace.errors import PerceptionError
-    from foretrace.perception.calibration import Board, read_pictures
+    from foretrace.perception.calibration import Board, read_images
     from foretrace.perception.calibration import calibrate as calibrate_camera
 
     board = Board(squares, square_length, marker_length, dictionary)
@@ -37,18 +37,18 @@ def calibrate(
         width, height = (1000 * length for length in board.size)
         print(f"{print_board}: print at 100 %, the board then measures {width:.1f} x {height:.1f} mm")
         return
-    if not pictures:
-        raise PerceptionError("no pictures are given: name pictures of the board, or --print-board FILE")
-    found = calibrate_camera(read_pictures(pictures), board)
+    if not images:
+        raise PerceptionError("no images are given: name images of the board, or --print-board FILE")
+    found = calibrate_camera(read_images(images), board)
     for name, error in found.errors.items():
         print(f"{name}: {error:.3f} pixels")
     for name, reason in found.left_out.items():
         say(f"left out: {name} {reason}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    found.camera.save(out, error_pixels=found.error, pictures=len(found.errors))
+    found.camera.save(out, error_pixels=found.error, images=len(found.errors))
     camera = found.camera
     print(
         f"focal lengths {camera.fx:.1f} and {camera.fy:.1f}, centre {camera.cx:.1f}, {camera.cy:.1f} pixels"
     )
-    print(f"error {found.error:.3f} pixels over {len(found.errors)} pictures")
+    print(f"error {found.error:.3f} pixels over {len(found.errors)} images")
     print(out)

@@ -1,4 +1,4 @@
-"""Calibrate a camera from pictures of a ChArUco board: a chessboard with a marker in every white square."""
+"""Calibrate a camera from images of a ChArUco board: a chessboard with a marker in every white square."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,20 +12,21 @@ from jaxtyping import Float, UInt8
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.recording_folder import read_image
 from foretrace.perception.markers import (
     Detections,
     MarkerBody,
     dictionary,
     fitting_dictionaries,
     grey,
-    picture_fault,
+    image_fault,
     to_transform,
 )
 
-FEWEST_PICTURES = 5
-"""So many pictures that show the board are needed."""
+FEWEST_IMAGES = 5
+"""So many images that show the board are needed."""
 FEWEST_CORNERS = 8
-"""A picture counts that shows at least so many inner corners of the board."""
+"""An image counts that shows at least so many inner corners of the board."""
 LARGEST_ERROR = 1.0
 """A calibration that misses the corners by more than this is refused [pixel]."""
 LOOSEST_FOCUS = 0.02
@@ -33,12 +34,12 @@ LOOSEST_FOCUS = 0.02
 FARTHEST_FOCUS = 0.2
 """Nor one that is further from the stated one than this part of it."""
 LEAST_TILT = np.deg2rad(10.0)
-"""Some pictures must see the board slanted by at least this, or the focal length stays unknown [rad]."""
+"""Some images must see the board slanted by at least this, or the focal length stays unknown [rad]."""
 PAPER = 0.02
 """White margin round a printed board [m]."""
 INCH = 0.0254
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Pictures that are read."""
+"""Images that are read."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Board:
         return self.squares[0] * self.square_length, self.squares[1] * self.square_length
 
     def draw(self, pixels_per_metre: float = 300 / INCH) -> UInt8[np.ndarray, "rows columns"]:
-        """The board as a picture, without a margin; at 300 dots per inch by default."""
+        """The board as an image, without a margin; at 300 dots per inch by default."""
         width, height = (round(length * pixels_per_metre) for length in self.size)
         return self._board.generateImage((width, height), marginSize=0)
 
@@ -95,15 +96,15 @@ class Board:
         if path.suffix.lower() not in (".png", ".pdf"):
             raise PerceptionError(f"cannot write a board to {path}: choose a name that ends in .png or .pdf")
         margin = round(PAPER * 300 / INCH)
-        picture = np.pad(self.draw(), margin, constant_values=255)
+        image = np.pad(self.draw(), margin, constant_values=255)
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path, dpi=(300, 300), resolution=300)
+        Image.fromarray(image).save(path, dpi=(300, 300), resolution=300)
 
     def find(
-        self, picture: UInt8[np.ndarray, "rows columns *channels"]
+        self, image: UInt8[np.ndarray, "rows columns *channels"]
     ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]:
         """Inner corners of the board [m] and where they were seen [pixel]; no rows where it was not."""
-        corners, ids, _, _ = self._detector.detectBoard(grey(picture))
+        corners, ids, _, _ = self._detector.detectBoard(grey(image))
         if ids is None or len(ids) == 0:
             return np.zeros((0, 3)), np.zeros((0, 2))
         known = np.asarray(self._board.getChessboardCorners(), dtype=float).reshape(-1, 3)
@@ -113,19 +114,19 @@ class Board:
 
     def pose(
         self,
-        picture: UInt8[np.ndarray, "rows columns *channels"],
+        image: UInt8[np.ndarray, "rows columns *channels"],
         camera: PinholeCamera,
-        name: str = "picture",
+        name: str = "image",
     ) -> Float[np.ndarray, "4 4"]:
         """T_board_camera: the camera's pose over a board that lies on the table, whose frame is the table frame.
 
         Raises:
-            PerceptionError: The picture is of another camera or does not show the board.
+            PerceptionError: The image is of another camera or does not show the board.
         """
-        camera.check_picture(picture, name)
-        points, pixels = self.find(picture)
+        camera.check_image(image, name)
+        points, pixels = self.find(image)
         if len(points) < FEWEST_CORNERS or not _spans_plane(points):
-            raise PerceptionError(f"{name} {self._what_is_missing(picture, len(points))}")
+            raise PerceptionError(f"{name} {self._what_is_missing(image, len(points))}")
         found, rvec, tvec = cv2.solvePnP(
             points, pixels, camera.matrix, camera.coefficients, flags=cv2.SOLVEPNP_IPPE
         )
@@ -134,11 +135,11 @@ class Board:
         rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, camera.coefficients, rvec, tvec)
         return invert_transform(to_transform(rvec, tvec))
 
-    def _what_is_missing(self, picture: UInt8[np.ndarray, "rows columns *channels"], found: int) -> str:
-        """Why a picture does not do, in words."""
-        if fault := picture_fault(picture):
+    def _what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"], found: int) -> str:
+        """Why an image does not do, in words."""
+        if fault := image_fault(image):
             return f"shows {found} corners of the board: {fault}"
-        fitting = fitting_dictionaries(picture)
+        fitting = fitting_dictionaries(image)
         if fitting and self.dictionary.lower() not in fitting:
             return (
                 f"shows {found} corners of the board: its markers are of {fitting[0]}, not {self.dictionary}"
@@ -160,58 +161,54 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated camera, and how well it explains the pictures."""
+    """A calibrated camera, and how well it explains the images."""
 
     camera: PinholeCamera
     """The camera."""
     error: float
     """Root mean square of the reprojection error over all corners [pixel]."""
     errors: dict[str, float]
-    """The same for each picture that was used."""
+    """The same for each image that was used."""
     left_out: dict[str, str]
-    """Pictures that were not used, and why."""
+    """Images that were not used, and why."""
 
 
-def calibrate(
-    pictures: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board
-) -> Calibration:
-    """Focal lengths, centre and distortion (k1, k2, p1, p2, k3) from pictures of a board (Zhang, 2000).
+def calibrate(images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board) -> Calibration:
+    """Focal lengths, centre and distortion (k1, k2, p1, p2, k3) from images of a board (Zhang, 2000).
 
     Args:
-        pictures: Pictures by name, all of one size: the board from several sides, slanted, also in the corners.
+        images: Images by name, all of one size: the board from several sides, slanted, also in the corners.
         board: What they show.
 
     Raises:
-        PerceptionError: Too few pictures show the board, their sizes differ, none sees it slanted, or no camera
+        PerceptionError: Too few images show the board, their sizes differ, none sees it slanted, or no camera
             explains them.
     """
-    sizes = {name: (picture.shape[1], picture.shape[0]) for name, picture in pictures.items()}
+    sizes = {name: (image.shape[1], image.shape[0]) for name, image in images.items()}
     if len(set(sizes.values())) > 1:
         first, second = list(dict.fromkeys(sizes.values()))[:2]
         odd = next(name for name, size in sizes.items() if size == second)
         raise PerceptionError(
-            f"pictures of different sizes: {odd} has {second[0]} x {second[1]} pixels, others {first[0]} x {first[1]}: "
-            "calibrate with pictures of one camera at one resolution"
+            f"images of different sizes: {odd} has {second[0]} x {second[1]} pixels, others {first[0]} x {first[1]}: "
+            "calibrate with images of one camera at one resolution"
         )
     points, pixels, used, left_out = [], [], [], {}
-    for name, picture in pictures.items():
-        known, seen = board.find(picture)
+    for name, image in images.items():
+        known, seen = board.find(image)
         if len(known) < FEWEST_CORNERS or not _spans_plane(known):
-            fault = picture_fault(picture)
+            fault = image_fault(image)
             left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
             continue
         points.append(known.astype(np.float32))
         pixels.append(seen.astype(np.float32))
         used.append(name)
-    if len(used) < FEWEST_PICTURES:
+    if len(used) < FEWEST_IMAGES:
         odd = next(iter(left_out), "")
         reason = (
-            f"; {odd} {board._what_is_missing(pictures[odd], len(board.find(pictures[odd])[0]))}"
-            if odd
-            else ""
+            f"; {odd} {board._what_is_missing(images[odd], len(board.find(images[odd])[0]))}" if odd else ""
         )
         raise PerceptionError(
-            f"{len(used)} of {len(pictures)} pictures show the board, {FEWEST_PICTURES} are needed{reason}"
+            f"{len(used)} of {len(images)} images show the board, {FEWEST_IMAGES} are needed{reason}"
         )
     size = next(iter(sizes.values()))
     error, matrix, distortion, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
@@ -222,12 +219,12 @@ def calibrate(
     ]
     if max(tilts) < LEAST_TILT:
         raise PerceptionError(
-            f"no picture sees the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
+            f"no image sees the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
             "the focal length cannot be told from that; tilt the board or the camera by 20 to 45 degrees"
         )
     if not error <= LARGEST_ERROR:
         raise PerceptionError(
-            f"no camera explains the pictures: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
+            f"no camera explains the images: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
             "accepted; check squares and flatness of the board, and that zoom and focus are fixed"
         )
     camera = PinholeCamera(
@@ -245,8 +242,8 @@ def calibrate(
     return Calibration(camera, float(error), errors, left_out)
 
 
-def read_pictures(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "rows columns 3"]]:
-    """Pictures by name, blue-green-red; folders stand for the pictures in them.
+def read_images(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "rows columns 3"]]:
+    """Images by name, blue-green-red; folders stand for the images in them.
 
     Raises:
         PerceptionError: One is missing or cannot be read, or there is none.
@@ -260,20 +257,8 @@ def read_pictures(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "r
         )
         files += inside
     if not files:
-        raise PerceptionError(f"no picture in {', '.join(map(str, paths))}: give {', '.join(SUFFIXES)} files")
-    return {str(file): read_picture(file) for file in files}
-
-
-def read_picture(path: str | Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """A picture as blue, green and red.
-
-    Raises:
-        PerceptionError: It is missing or cannot be read.
-    """
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
-    if picture is None:
-        raise PerceptionError(f"cannot read a picture from {path}: give a whole PNG or JPEG file")
-    return picture
+        raise PerceptionError(f"no image in {', '.join(map(str, paths))}: give {', '.join(SUFFIXES)} files")
+    return {str(file): read_image(file) for file in files}
 
 
 def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
@@ -288,10 +273,10 @@ def refine_camera(
 ) -> tuple[PinholeCamera, float]:
     """The camera whose focal lengths and first radial distortion explain best how known markers look.
 
-    For pictures that were taken or straightened with a camera file that is not quite theirs. A board tells more.
+    For images that were taken or straightened with a camera file that is not quite theirs. A board tells more.
 
     Args:
-        detections: The markers in each picture; the body must be seen from several sides.
+        detections: The markers in each image; the body must be seen from several sides.
         body: The markers.
         camera: The camera as far as it is known.
 
@@ -299,13 +284,11 @@ def refine_camera(
         The camera, and the root mean square of the reprojection error that remains [pixel].
 
     Raises:
-        PerceptionError: The pictures do not tell: too few, or too much alike.
+        PerceptionError: The images do not tell: too few, or too much alike.
     """
     matches = [match for seen in detections if len((match := body.matches(seen))[0])]
-    if len(matches) < FEWEST_PICTURES:
-        raise PerceptionError(
-            f"markers {body.ids} are in {len(matches)} pictures, {FEWEST_PICTURES} are needed"
-        )
+    if len(matches) < FEWEST_IMAGES:
+        raise PerceptionError(f"markers {body.ids} are in {len(matches)} images, {FEWEST_IMAGES} are needed")
     if len(camera.distortion) > 5:
         raise PerceptionError(
             "a camera with 8 distortion coefficients cannot be refined: calibrate it with a board"
@@ -320,7 +303,7 @@ def refine_camera(
     loose = np.ravel(deviations)[:2].max() > LOOSEST_FOCUS * camera.fx
     if not np.isfinite(error) or loose or abs(matrix[0, 0] / camera.fx - 1) > FARTHEST_FOCUS:
         raise PerceptionError(
-            f"{len(matches)} pictures of markers {body.ids} leave the focal length open: slant them more, both ways"
+            f"{len(matches)} images of markers {body.ids} leave the focal length open: slant them more, both ways"
         )
     fx, fy = (float(matrix[k, k]) for k in (0, 1))
     found = tuple(float(value) for value in np.ravel(lens)[:5])

@@ -39,7 +39,7 @@ MOST_LACKING = 0.9
 MOST_ALIKE = 0.5
 """Of what has more of the background's colour than this, a part may be taken for shadow: its sides are darker."""
 ENCLOSING_GAP = 15
-"""A shadow encloses what it surrounds but for gaps as wide as this [pixel]: that is rather a picture on an object."""
+"""A shadow encloses what it surrounds but for gaps as wide as this [pixel]: that is rather an image on an object."""
 DOUBTFUL = (
     "shadow and object cannot be told apart: what differs from the background has its colour, and may be a shadow or "
     "an object of that colour; find the object by depth, lay a sheet of another colour on the table, or light it from "
@@ -49,7 +49,7 @@ DOUBTFUL = (
 
 @dataclass(frozen=True)
 class Shadow:
-    """What a picture shows of shadows."""
+    """What an image shows of shadows."""
 
     pixels: Bool[np.ndarray, "rows columns"]
     """Where shadow is seen, and nothing but the background in it."""
@@ -65,8 +65,8 @@ def find_shadow(
     """Shadows on the background, if there are any.
 
     Args:
-        now: The picture.
-        before: The background under the light of the picture as a whole.
+        now: The image.
+        before: The background under the light of the image as a whole.
         changed: Where they differ.
 
     Raises:

@@ -75,7 +75,7 @@ ROBOT_MODES = {
 
 @dataclass(frozen=True)
 class ArmState:
-    """What the controller last said."""
+    """State of the arm that the controller last sent."""
 
     timestamp: float
     """Time since the controller was started [s]."""
@@ -129,7 +129,7 @@ class UrController:
         self._heard, self._timestamp = time.monotonic(), -np.inf
 
     def state(self) -> ArmState:
-        """What the controller last said."""
+        """State that the controller last sent."""
         receive = self._receive
         return ArmState(
             timestamp=receive.getTimestamp(),

@@ -30,7 +30,7 @@ MINIMAL_HEIGHT = 0.008
 
 @dataclass(frozen=True)
 class RgbdFrame:
-    """One picture of an RGB-D camera."""
+    """One image of an RGB-D camera."""
 
     rgb: UInt8[np.ndarray, "rows columns 3"]
     """Colour."""
@@ -42,7 +42,7 @@ class RgbdFrame:
     """Pose of the camera in the action frame (camera frame: x right, y down, z forward)."""
 
     def view(self) -> TopDownView:
-        """The picture seen from above: what every real depth image goes through, too."""
+        """The image seen from above: what every real depth image goes through, too."""
         points = self.camera.deproject(self.depth, self.T_action_camera)
         return TopDownView.from_points(points, MINIMAL_HEIGHT)
 
@@ -62,7 +62,7 @@ class RgbdConfig:
 def take_rgbd(
     obj: ObjectModel, action: LeverUp, config: RgbdConfig = RgbdConfig(), *, seed: int = 0
 ) -> RgbdFrame:
-    """Renders the object on the table before the arm comes into the picture.
+    """Renders the object on the table before the arm comes into the image.
 
     Args:
         obj: The object.
@@ -76,7 +76,7 @@ def take_rgbd(
     camera = config.camera
     spec = build_scene(obj, Physics(), Tool(), None, timestep=0.002)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
-    # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the picture.
+    # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the image.
     spec.worldbody.add_camera(name="above", pos=config.position, quat=[np.sqrt(0.5), 0, 0, -np.sqrt(0.5)])
     model = spec.compile()
     model.cam_fovy[0] = np.rad2deg(2 * np.arctan(camera.height / 2 / camera.fy))
@@ -95,7 +95,7 @@ def take_rgbd(
     sigma = config.noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     depth += np.random.default_rng(seed).normal(size=depth.shape) * sigma
     T = np.eye(4)
-    # The picture's rows run along -x and its columns along -y of the action frame, as in the top-down view.
+    # The image's rows run along -x and its columns along -y of the action frame, as in the top-down view.
     T[:3, :3] = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
     T[:3, 3] = config.position
     return RgbdFrame(rgb, depth, camera, T)

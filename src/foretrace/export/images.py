@@ -1,4 +1,4 @@
-"""Pictures of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
+"""Images of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs.
@@ -26,8 +26,8 @@ CAMERA_AIM = np.array([0.04, 0.0, 0.04])
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """What a colour and depth camera sees, picture by picture."""
+class RenderedImages:
+    """What a colour and depth camera sees, image by image."""
 
     rgb: UInt8[np.ndarray, "time rows columns 3"]
     """Colour."""
@@ -51,11 +51,11 @@ def camera_pose() -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def take_pictures(
+def render_images(
     interaction: Interaction,
     object_poses: Float[np.ndarray, "time 7"],
     tool_poses: Float[np.ndarray, "time 7"],
-) -> Pictures:
+) -> RenderedImages:
     """Renders a simulated interaction: object, screwdriver and table, without the arm.
 
     Args:
@@ -86,7 +86,7 @@ def take_pictures(
     try:
         renderer = make_renderer(model, CAMERA.height, CAMERA.width)
     except SimulationError as error:
-        raise ExportError(f"{error}; or export without pictures: --no-camera") from error
+        raise ExportError(f"{error}; or export without images: --no-camera") from error
     with renderer:
         for k in range(len(bodies)):
             data.qpos[:] = np.concatenate([bodies[k], tool_poses[k]])
@@ -99,4 +99,4 @@ def take_pictures(
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
                 wanted[k] = renderer.render()
                 renderer.disable_depth_rendering()
-    return Pictures(rgb, depth, CAMERA, pose)
+    return RenderedImages(rgb, depth, CAMERA, pose)
