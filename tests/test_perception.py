@@ -3,6 +3,7 @@
 import itertools
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -185,6 +186,27 @@ def test_calibrate_command(
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
     assert main(["calibrate", str(tmp_path / "nothing.png")]) == 2
     assert "cannot read an image" in capsys.readouterr().err
+
+
+def test_the_command_refines_a_camera_by_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, slant in enumerate(np.linspace(0.4, 0.9, 6)):
+        T = looking_at(*(slant * np.array([np.cos(2.0 * k), np.sin(2.0 * k)])), 0.3)
+        cv2.imwrite(str(folder / f"{k}.png"), marker_scene("apriltag_36h11", 7, 0.08, T))
+    stated, layout, out = (tmp_path / f"{name}.json" for name in ("stated", "markers", "refined"))
+    replace(CAMERA, fx=0.96 * CAMERA.fx, fy=0.96 * CAMERA.fy).save(stated)
+    marker = {"id": 7, "side": 0.08}
+    content = {"format": "foretrace-markers", "version": 1, "dictionary": "apriltag_36h11"}
+    layout.write_text(json.dumps(content | {"table": [marker], "object": [{"id": 8, "side": 0.04}]}))
+    command = ["calibrate", str(folder), "--refine", str(stated), "--out", str(out)]
+    assert main(command) == 2
+    assert "--markers LAYOUT go together" in capsys.readouterr().err
+    assert main([*command, "--markers", str(layout)]) == 0
+    assert "over 6 images" in capsys.readouterr().out
+    refined = PinholeCamera.load(out)
+    assert refined.fx == pytest.approx(CAMERA.fx, rel=0.01)
+    assert refined.fy == pytest.approx(CAMERA.fy, rel=0.01)
 
 
 @pytest.mark.parametrize("name", ["5x5_100", "apriltag_36h11"])

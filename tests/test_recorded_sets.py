@@ -122,7 +122,7 @@ def test_recordings_get_the_tables_of_the_paper(
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", "cannot be read"), ("[]", "does not tell the recording"), ('{"recording": 3}', "the recording")],
+    [("{", "cannot be read"), ("[]", "holds a list"), ('{"recording": 3}', "lacks recording")],
 )
 def test_damaged_notes_are_refused(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / NOTES_FOLDER).mkdir()

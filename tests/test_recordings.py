@@ -165,7 +165,7 @@ def test_why_no_marker_is_found(recorded: tuple[Path, RecordingTruth], tmp_path:
     few = some_of(folder, tmp_path / "few", frames=3)
     layout = json.loads((few / "markers.json").read_text())
     (few / "markers.json").write_text(json.dumps(layout | {"dictionary": "4x4_50"}))
-    with pytest.raises(PerceptionError, match="has markers of apriltag_36h11"):
+    with pytest.raises(PerceptionError, match="its markers are of apriltag_36h11, not 4x4_50"):
         look(few)
     (few / "markers.json").write_text(json.dumps(layout | {"object": [{"id": 77, "side": 0.04}]}))
     with pytest.raises(PerceptionError, match=r"markers \[77\] are seen in 0 of 3 frames.*seen are \["):

@@ -29,7 +29,7 @@ def capture(
         width: Columns of the images.
         height: Rows of the images.
         fps: Frames per second.
-        depth_every: Keep depth, aligned with colour, with every so many images; 0: never.
+        depth_every: Images from one with aligned depth to the next; 0: no depth.
         serial: Serial number of the camera, if there are several.
     """
     import signal

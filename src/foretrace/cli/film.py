@@ -42,7 +42,7 @@ def film(
         slant: Angle of the camera's line of sight from the vertical [rad].
         azimuth: Where the camera stands, from the action's direction towards its left [rad].
         distance: From the camera to the point on the table that it looks at [m].
-        depth_every: Keep depth with every so many images; 0: never.
+        depth_every: Images from one with depth to the next; 0: no depth.
         embodiment: What moves the blade: nothing that is seen, or the whole arm; by default as in the data set.
         board: Number of images of a calibration board to take, too; they leave the camera's file to `calibrate`.
         shadows: Let a slanted lamp of some size cast soft shadows.
@@ -70,7 +70,7 @@ def film(
     rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
     if len(rows) == 0:
         raise DatasetError(
-            f"{data} has no interaction {id} with a motion: `foretrace describe` tells what it has"
+            f"{data} has no interaction {id} with a motion: `foretrace describe` lists what it has"
         )
     shown = dataset[int(rows[0])]
     camera = WEBCAM.scaled(width / WEBCAM.width)

@@ -21,7 +21,7 @@ def overlay(
     Beside it an image is written that shows both paths from the side, its name with "-side.png" in place of ".mp4".
 
     Red: predicted, before the touch. Green: observed so far. White: the object's outline. A translucent tube: how
-    uncertain the prediction is, where the predictor says so. Needs foretrace[video], and the recording
+    uncertain the prediction is, if the predictor predicts it. Needs foretrace[video], and the recording
     where it was when it was imported.
 
     Args:

@@ -46,9 +46,9 @@ def import_recording(
         contact_px: Column and row of the contact in the first frame, on the object's upper rim.
         edge: Number of the edge that was levered.
         fraction: How far along that edge.
-        start: Time stamp at which the blade's path starts [s]; by default told from when the object moves.
+        start: Time stamp at which the blade's path starts [s]; by default from when the object moves.
         max_gap: The longest time without markers that is bridged [s].
-        shadows: Whether the object may cast shadows, which are then told from it; else all that differs from the
+        shadows: Whether the object may cast shadows, which are then separated from it; else all that differs from the
             background is the object.
         topic: Image topic of a bag, if it has several.
         depth_topic: Depth topic of a bag, aligned with the images; by default the one in the same frame, if any.

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foretrace.errors import ExportError, SimulationError
-from foretrace.geometry import matrix_to_pose, pose_to_matrix
+from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
-from foretrace.simulation.camera import make_renderer
+from foretrace.simulation.camera import make_renderer, render
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.tool import Tool, add_blade
 
@@ -78,9 +78,7 @@ def render_images(
     model = spec.compile()
     model.cam_fovy[0] = np.rad2deg(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
     data = mujoco.MjData(model)
-    T_object_body = np.eye(4)
-    T_object_body[:3, 3] = body_origin(obj)
-    bodies = matrix_to_pose(pose_to_matrix(object_poses) @ T_object_body)
+    bodies = matrix_to_pose(pose_to_matrix(object_poses) @ planar_transform(body_origin(obj), 0.0))
     shape = (len(bodies), CAMERA.height, CAMERA.width)
     rgb, depth = np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
     try:
@@ -91,12 +89,6 @@ def render_images(
         for k in range(len(bodies)):
             data.qpos[:] = np.concatenate([bodies[k], tool_poses[k]])
             mujoco.mj_forward(model, data)
-            for wanted in (rgb, depth):
-                if wanted is depth:
-                    renderer.enable_depth_rendering()
-                renderer.update_scene(data, camera="beside")
-                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-                wanted[k] = renderer.render()
-                renderer.disable_depth_rendering()
+            rgb[k] = render(renderer, data, "beside")
+            depth[k] = render(renderer, data, "beside", depth=True)
     return RenderedImages(rgb, depth, CAMERA, pose)

@@ -1,7 +1,6 @@
 """Interactions as a LeRobotDataset v3.0: Parquet files and their description, which LeRobot's loader reads."""
 
 import io
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from foretrace.export.episode_statistics import (
 from foretrace.export.episodes import Episode
 from foretrace.export.images import CAMERA, render_images
 from foretrace.export.resampling import frame_times, frames_per_second, resample, resample_poses
+from foretrace.files import write_json
 from foretrace.interactions.topdown import VIEW_SIZE
 
 CODEBASE_VERSION = "v3.0"
@@ -319,6 +319,6 @@ def _write_description(
         for feature in layout.features
     }
     for name, content in (("info", info), ("stats", whole)):
-        (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+        write_json(folder / "meta" / f"{name}.json", content, indent=4)
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task"))
     tasks.to_parquet(folder / "meta" / "tasks.parquet")

@@ -32,7 +32,7 @@ START = 1.0
 MARKER_PERIOD = 1.0
 """Markers that hang on a frame are sent anew so often [s], for viewers that join late."""
 MOST_PATHS = 60
-"""The observed path is sent so many times at most, ever longer."""
+"""Most messages with the observed path, each longer than the one before."""
 DOT = np.full(3, 0.012)
 """Size of the dots at the centres of mass [m]."""
 TOPICS = {

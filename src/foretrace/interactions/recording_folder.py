@@ -45,7 +45,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class RecordingNotes:
-    """What a recording says about itself."""
+    """Unit of the depth images and start of the action."""
 
     depth_unit: float = 0.001
     """Unit of the depth images [m]."""
@@ -131,7 +131,7 @@ def write_recording(folder: Path, frames: Iterable[Frame], notes: RecordingNotes
     Args:
         folder: An empty or new folder.
         frames: The frames, in order.
-        notes: What the recording says about itself; its depth unit is that of `DEPTH_UNIT`.
+        notes: Start of the action; the depth unit becomes `DEPTH_UNIT`.
 
     Raises:
         PerceptionError: An image cannot be written.

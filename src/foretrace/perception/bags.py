@@ -15,9 +15,9 @@ from foretrace.perception.bag_images import is_depth, read_colour, read_depth
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TOGETHER = 0.02
-"""Depth belongs to a colour image taken at most so much earlier or later [s]."""
+"""Largest time between a colour image and the depth that belongs to it [s]."""
 PATIENCE = 0.5
-"""So long a colour image waits for a depth image that comes after it [s]."""
+"""Time for which a colour image waits for a later depth image [s]."""
 
 
 class _Stream(NamedTuple):

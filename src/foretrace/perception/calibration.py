@@ -17,29 +17,28 @@ from foretrace.perception.markers import (
     Detections,
     MarkerBody,
     dictionary,
-    fitting_dictionaries,
     grey,
     image_fault,
     to_transform,
 )
 
 FEWEST_IMAGES = 5
-"""So many images that show the board are needed."""
+"""Least number of images that show the board."""
 FEWEST_CORNERS = 8
-"""An image counts that shows at least so many inner corners of the board."""
+"""Least number of inner corners of the board in an image that counts."""
 LARGEST_ERROR = 1.0
-"""A calibration that misses the corners by more than this is refused [pixel]."""
+"""Largest reprojection error of a calibration [pixel]."""
 LOOSEST_FOCUS = 0.02
-"""A focal length less certain than by this part of it is not believed."""
+"""Largest relative standard deviation of a refined focal length."""
 FARTHEST_FOCUS = 0.2
-"""Nor one that is further from the stated one than this part of it."""
+"""Largest relative change of a refined focal length."""
 LEAST_TILT = np.deg2rad(10.0)
-"""Some images must see the board slanted by at least this, or the focal length stays unknown [rad]."""
+"""Least slant of the board in one of the images; without it the focal length stays unknown [rad]."""
 PAPER = 0.02
 """White margin round a printed board [m]."""
 INCH = 0.0254
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Images that are read."""
+"""Endings of image files."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class Board:
         camera.check_image(image, name)
         points, pixels = self.find(image)
         if len(points) < FEWEST_CORNERS or not _spans_plane(points):
-            raise PerceptionError(f"{name} {self._what_is_missing(image, len(points))}")
+            raise PerceptionError(f"{name} {self.what_is_missing(image)}")
         found, rvec, tvec = cv2.solvePnP(
             points, pixels, camera.matrix, camera.coefficients, flags=cv2.SOLVEPNP_IPPE
         )
@@ -135,19 +134,12 @@ class Board:
         rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, camera.coefficients, rvec, tvec)
         return invert_transform(to_transform(rvec, tvec))
 
-    def _what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"], found: int) -> str:
-        """Why an image does not do, in words."""
-        if fault := image_fault(image):
-            return f"shows {found} corners of the board: {fault}"
-        fitting = fitting_dictionaries(image)
-        if fitting and self.dictionary.lower() not in fitting:
-            return (
-                f"shows {found} corners of the board: its markers are of {fitting[0]}, not {self.dictionary}"
-            )
-        return (
-            f"shows {found} corners of the board, {FEWEST_CORNERS} over two rows are needed: show more of it, and "
-            "check squares and dictionary"
-        )
+    def what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
+        """Why an image does not show enough of the board, in words."""
+        found = f"shows {len(self.find(image)[0])} corners of the board"
+        if fault := image_fault(image, self.dictionary):
+            return f"{found}: {fault}"
+        return f"{found}, {FEWEST_CORNERS} over two rows are needed: show more of it, and check squares and dictionary"
 
     @cached_property
     def _board(self) -> cv2.aruco.CharucoBoard:
@@ -181,65 +173,68 @@ def calibrate(images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]],
         board: What they show.
 
     Raises:
-        PerceptionError: Too few images show the board, their sizes differ, none sees it slanted, or no camera
+        PerceptionError: Too few images show the board, their sizes differ, none shows it slanted, or no camera
             explains them.
     """
-    sizes = {name: (image.shape[1], image.shape[0]) for name, image in images.items()}
-    if len(set(sizes.values())) > 1:
-        first, second = list(dict.fromkeys(sizes.values()))[:2]
-        odd = next(name for name, size in sizes.items() if size == second)
-        raise PerceptionError(
-            f"images of different sizes: {odd} has {second[0]} x {second[1]} pixels, others {first[0]} x {first[1]}: "
-            "calibrate with images of one camera at one resolution"
-        )
-    points, pixels, used, left_out = [], [], [], {}
-    for name, image in images.items():
-        known, seen = board.find(image)
-        if len(known) < FEWEST_CORNERS or not _spans_plane(known):
-            fault = image_fault(image)
-            left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
-            continue
-        points.append(known.astype(np.float32))
-        pixels.append(seen.astype(np.float32))
-        used.append(name)
-    if len(used) < FEWEST_IMAGES:
+    points, pixels, left_out = _find_corners(images, board)
+    if len(points) < FEWEST_IMAGES:
         odd = next(iter(left_out), "")
-        reason = (
-            f"; {odd} {board._what_is_missing(images[odd], len(board.find(images[odd])[0]))}" if odd else ""
-        )
+        reason = f"; {odd} {board.what_is_missing(images[odd])}" if odd else ""
         raise PerceptionError(
-            f"{len(used)} of {len(images)} images show the board, {FEWEST_IMAGES} are needed{reason}"
+            f"{len(points)} of {len(images)} images show the board, {FEWEST_IMAGES} are needed{reason}"
         )
-    size = next(iter(sizes.values()))
+    rows, columns = next(iter(images.values())).shape[:2]
+    size = columns, rows
     error, matrix, distortion, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
-        points, pixels, size, np.eye(3), np.zeros(5)
+        list(points.values()), list(pixels.values()), size, np.eye(3), np.zeros(5)
     )
     tilts = [
         np.arccos(np.clip(abs(to_transform(r, t)[2, 2]), 0, 1)) for r, t in zip(rvecs, tvecs, strict=True)
     ]
     if max(tilts) < LEAST_TILT:
         raise PerceptionError(
-            f"no image sees the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
-            "the focal length cannot be told from that; tilt the board or the camera by 20 to 45 degrees"
+            f"no image shows the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
+            "that leaves the focal length open; tilt the board or the camera by 20 to 45 degrees"
         )
     if not error <= LARGEST_ERROR:
         raise PerceptionError(
             f"no camera explains the images: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
             "accepted; check squares and flatness of the board, and that zoom and focus are fixed"
         )
-    camera = PinholeCamera(
-        *size,
-        matrix[0, 0],
-        matrix[1, 1],
-        matrix[0, 2],
-        matrix[1, 2],
-        tuple(np.ravel(distortion)[:5].tolist()),
-    )
-    errors = {
-        name: float(np.sqrt((np.linalg.norm(camera.project(p, to_transform(r, t)) - q, axis=1) ** 2).mean()))
-        for name, p, q, r, t in zip(used, points, pixels, rvecs, tvecs, strict=True)
-    }
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    camera = PinholeCamera(*size, fx, fy, cx, cy, tuple(np.ravel(distortion)[:5].tolist()))
+    errors = {}
+    for name, rvec, tvec in zip(points, rvecs, tvecs, strict=True):
+        miss = camera.project(points[name], to_transform(rvec, tvec)) - pixels[name]
+        errors[name] = float(np.sqrt((np.linalg.norm(miss, axis=1) ** 2).mean()))
     return Calibration(camera, float(error), errors, left_out)
+
+
+def _find_corners(
+    images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, str]]:
+    """Corners of the board and their pixels in the images that show it; why the other images do not.
+
+    Raises:
+        PerceptionError: The images differ in size.
+    """
+    sizes = {name: f"{image.shape[1]} x {image.shape[0]}" for name, image in images.items()}
+    if len(set(sizes.values())) > 1:
+        first, second = list(dict.fromkeys(sizes.values()))[:2]
+        odd = next(name for name, size in sizes.items() if size == second)
+        raise PerceptionError(
+            f"images of different sizes: {odd} has {second} pixels, others {first}: calibrate with images of "
+            "one camera at one resolution"
+        )
+    points, pixels, left_out = {}, {}, {}
+    for name, image in images.items():
+        known, seen = board.find(image)
+        if len(known) < FEWEST_CORNERS or not _spans_plane(known):
+            fault = image_fault(image)
+            left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
+            continue
+        points[name], pixels[name] = known.astype(np.float32), seen.astype(np.float32)
+    return points, pixels, left_out
 
 
 def read_images(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "rows columns 3"]]:
@@ -271,9 +266,9 @@ def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
 def refine_camera(
     detections: Sequence[Detections], body: MarkerBody, camera: PinholeCamera
 ) -> tuple[PinholeCamera, float]:
-    """The camera whose focal lengths and first radial distortion explain best how known markers look.
+    """The camera whose focal lengths and first radial distortion fit images of known markers best.
 
-    For images that were taken or straightened with a camera file that is not quite theirs. A board tells more.
+    For images with a camera file that is not quite theirs. Images of a board give a better calibration.
 
     Args:
         detections: The markers in each image; the body must be seen from several sides.
@@ -284,7 +279,7 @@ def refine_camera(
         The camera, and the root mean square of the reprojection error that remains [pixel].
 
     Raises:
-        PerceptionError: The images do not tell: too few, or too much alike.
+        PerceptionError: There are too few images, or they are too much alike.
     """
     matches = [match for seen in detections if len((match := body.matches(seen))[0])]
     if len(matches) < FEWEST_IMAGES:

@@ -28,12 +28,11 @@ from foretrace.perception.markers import (
     MarkerLayout,
     align_patterns,
     detect_markers,
-    fitting_dictionaries,
     image_fault,
 )
 from foretrace.perception.masks import DEPTH_RIM, find_by_background, find_by_height, heights_above_table
 from foretrace.perception.recordings import Recording
-from foretrace.perception.tracking import Track, TrackConfig, still_pose, track
+from foretrace.perception.tracking import Track, TrackConfig, check_times, still_pose, track
 from foretrace.perception.views import (
     Observation,
     PlacedObject,
@@ -50,7 +49,7 @@ simulated lever-ups, whose standard deviation is 0.016 s."""
 ONSET_SHIFT = 0.001
 """How far that is [m]."""
 REST_TIME = 0.2
-"""So long the object must be seen at rest before it moves [s]."""
+"""Least time for which the object lies at rest before it moves [s]."""
 TABLE_FRAMES = 15
 """Frames whose table markers are measured with care; the camera stands still."""
 LEAST_LEVEL = 0.03
@@ -72,7 +71,7 @@ class ImportConfig:
     height: float | None = None
     """Height of an object of unknown shape [m]; by default that of its marker above the table."""
     shadows: bool = True
-    """Whether there may be shadows, which are then told from the object."""
+    """Whether there may be shadows, which are then separated from the object."""
 
     def __post_init__(self) -> None:
         if self.start is not None and not np.isfinite(self.start):
@@ -186,11 +185,6 @@ def _detect_all(
     hopeless = None
     for number, frame in enumerate(recording.frames()):
         camera.check_image(frame.image, f"frame {number} of {recording.path}")
-        if times and frame.time <= times[-1]:
-            raise PerceptionError(
-                f"time stamps of {recording.path} do not increase: frame {number} at {frame.time:.6f} s follows "
-                f"{times[-1]:.6f} s; sort or record again"
-            )
         if frame.depth is not None:
             camera.check_image(frame.depth, f"depth image {number} of {recording.path}")
         seen = detect_markers(frame.image, layout.dictionary)
@@ -200,6 +194,7 @@ def _detect_all(
         first = first or [frame]
         if hopeless is None and not (table | thing) & set(seen.ids.tolist()):
             hopeless = frame.image
+    check_times(np.array(times), f" of {recording.path}")
     for name, ids in (("object", thing), ("table", table)):
         count = sum(bool(ids & set(seen.ids.tolist())) for seen in detections)
         if count < 2:
@@ -212,15 +207,11 @@ def _detect_all(
 
 def _excuse(image: UInt8[np.ndarray, "rows columns 3"], layout: MarkerLayout) -> str:
     """Why markers may not have been found in an image."""
-    if fault := image_fault(image):
-        return fault
-    fitting = [name for name in fitting_dictionaries(image) if name != layout.dictionary.lower()]
-    here = detect_markers(image, layout.dictionary).ids.tolist()
-    if here:
+    if here := detect_markers(image, layout.dictionary).ids.tolist():
         return f"seen are {sorted(here)}; check the ids in the marker layout"
-    if fitting:
-        return f"the image has markers of {fitting[0]}; check the dictionary in the marker layout"
-    return "no marker of any known dictionary is in the image; bring it nearer or light it better"
+    return image_fault(image, layout.dictionary) or (
+        "no marker of any known dictionary is in the image; bring it nearer or light it better"
+    )
 
 
 def _careful(detections: Sequence[Detections], layout: MarkerLayout) -> list[Detections]:

@@ -39,20 +39,20 @@ DARK = 25
 BLURRED = 15.0
 """An image whose Laplacian varies by less than this has no sharp edge (grey values squared)."""
 SMALLEST_SIDE = 10.0
-"""A marker of fewer pixels along its shortest side tells no pose."""
+"""Least length of the shortest side of a marker whose pose is measured [pixel]."""
 LEAST_SLANT = np.deg2rad(15.0)
-"""A marker that is looked at more flatly than this tells no pose: its two poses look alike, its pattern blurs [rad]."""
+"""Least angle between marker and line of sight: below, its two poses look alike and its pattern blurs [rad]."""
 
 CELL = 16
 """Pixels along a module of the pattern that is drawn."""
 OVERSAMPLING = 4
-"""It is drawn with so many times the image's pixels, then averaged."""
+"""Pixels of the drawing along a pixel of the image, which are averaged."""
 BLUR = 0.8
 """Standard deviation of what lens and sensor blur [pixel]."""
 BORDER = 6
-"""Pixels round a marker that are looked at."""
+"""Pixels round a marker that take part."""
 LARGEST_ALIGNMENT = 6.0
-"""Alignment that moves a corner further than this has gone astray [pixel]."""
+"""Largest shift of a corner by an alignment that has not gone astray [pixel]."""
 LEAST_CORRELATION = 0.7
 """An image that resembles the pattern less shows the marker covered or smeared."""
 
@@ -196,14 +196,22 @@ def fitting_dictionaries(image: UInt8[np.ndarray, "rows columns *channels"]) -> 
     return sorted(counts, key=lambda name: -counts[name])
 
 
-def image_fault(image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
-    """What may keep markers from being found in an image, in words; empty if nothing is apparent."""
+def image_fault(image: UInt8[np.ndarray, "rows columns *channels"], name: str | None = None) -> str:
+    """What may keep markers from being found in an image, in words; empty if nothing is apparent.
+
+    Args:
+        image: The image.
+        name: Dictionary of the markers; if given, an image with markers of other dictionaries alone is at fault.
+    """
     values = grey(image)
     if np.percentile(values, 99) < DARK:
         return f"it is dark (99 % of the pixels are below {np.percentile(values, 99):.0f} of 255)"
     sharpness = float(cv2.Laplacian(values, cv2.CV_64F).var())
     if sharpness < BLURRED:
         return f"it is blurred or empty (its Laplacian varies by {sharpness:.1f}, below {BLURRED:g})"
+    fitting = [] if name is None else fitting_dictionaries(image)
+    if fitting and name is not None and name.lower() not in fitting:
+        return f"its markers are of {fitting[0]}, not {name}: check the dictionary"
     return ""
 
 

@@ -16,9 +16,9 @@ from foretrace.perception.shadows import Shadow, find_shadow
 LEAST_CHANGE = 14.0
 """A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
 EDGE_DEPTH = 4
-"""So many pixels inside what differs, a blurred edge has risen to the object's own colour."""
+"""Pixels within which a blurred edge rises to the object's own colour."""
 BORDER = 3
-"""So far from a mask's border pixels may be covered in part [pixel]."""
+"""Distance from a mask's border in which pixels may be covered in part [pixel]."""
 SMALLEST_OBJECT = 400
 """An object of fewer pixels is taken for noise."""
 DEPTH_RIM = 2 * MINIMAL_HEIGHT
@@ -326,7 +326,7 @@ def _fit_plane(points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "3"]
 def heights_above_table(
     depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, T_table_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Height of what each pixel sees above the table [m]; NaN where nothing was seen."""
+    """Height above the table of the point in each pixel [m]; NaN without depth."""
     camera.check_image(depth, "depth image")
     heights = np.full(depth.shape, np.nan)
     seen = np.isfinite(depth) & (depth > 0)

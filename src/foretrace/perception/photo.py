@@ -67,7 +67,7 @@ class PhotoView(Observation):
 
     @property
     def com(self) -> Float[np.ndarray, "3"] | None:
-        """Centre of mass at rest in the action frame [m]; None where the view alone tells it."""
+        """Centre of mass at rest in the action frame [m]; None where only the view determines it."""
         return self.com_in_action if self.flat else None
 
     @property

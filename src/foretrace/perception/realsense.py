@@ -1,6 +1,6 @@
 """RealSense cameras and their recordings, through the maker's library (``pip install foretrace[realsense]``).
 
-Depth is aligned with the colour images by that library, which knows where the two sensors sit. It was tried on
+Depth is aligned with the colour images by that library, which has the poses of the two sensors. Tested on
 recordings of a virtual camera only.
 """
 
@@ -14,15 +14,14 @@ import numpy as np
 from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import Frame
+from foretrace.perception.bags import TOGETHER
 
-TOGETHER = 0.02
-"""Depth belongs to a colour image taken at most so much earlier or later [s]."""
 LOOK = 1 << 22
-"""Bytes at either end of a bag in which the names of its topics are looked for."""
+"""Bytes at either end of a bag that are searched for the names of its topics."""
 SILENCE = 5000
-"""So long a camera or a recording may give no image [ms]."""
+"""Longest time without an image [ms]."""
 GLANCE = 200
-"""So long a recording is waited for before it is asked whether it has ended [ms]."""
+"""Time between two checks whether a recording has ended [ms]."""
 WARM_UP = 30
 """Frames after the start that are thrown away: a camera needs them to find its exposure."""
 
@@ -42,7 +41,7 @@ class CaptureConfig:
     frames_per_second: int = 30
     """Frames per second."""
     depth_every: int = 10
-    """Depth is kept with every so many colour images; 0: never."""
+    """Colour images from one with depth to the next; 0: no depth."""
     serial: str | None = None
     """Serial number of the camera; None: the only one."""
 
@@ -240,7 +239,7 @@ class LiveCamera:
         """Frames as they come.
 
         Args:
-            until: Asked with the time since the first frame [s]; says when to stop.
+            until: Whether to stop, from the time since the first frame [s].
 
         Raises:
             PerceptionError: The camera falls silent.

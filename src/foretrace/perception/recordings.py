@@ -28,7 +28,7 @@ class Recording:
     frames: Callable[[], Iterator[Frame]]
     """Reads the frames, from the beginning each time."""
     notes: RecordingNotes = field(default_factory=RecordingNotes)
-    """What the recording says about itself."""
+    """Its notes."""
     camera: PinholeCamera | None = None
     """The camera, if the recording names it."""
 

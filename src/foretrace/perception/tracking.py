@@ -3,7 +3,7 @@
 Every frame gives up to two poses that explain it. Which one is meant is decided for the whole recording at once, by the
 least reprojection error and the least turning from frame to frame (Viterbi, 1967). From there all frames are fitted
 together: the corners where they were seen, the motion with as little acceleration as they allow, outliers and
-impacts forgiven (Huber, 1964). What a fit of the whole recording says of a frame lags behind nothing.
+impacts forgiven (Huber, 1964). The fit of the whole recording has no delay.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ Matches = tuple[np.ndarray, np.ndarray]
 NOTHING: Matches = (np.zeros((0, 3)), np.zeros((0, 2)))
 ITERATIONS = 12
 HUBER = 1.5
-"""Residuals up to so many standard deviations count in full."""
+"""Largest residual that counts in full [standard deviations]."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class TrackConfig:
     largest_error: float = 3.0
     """A frame whose best pose misses the corners by more counts as not seen [pixel]."""
     turning: float = 6.0
-    """Turning that is taken for normal when two poses are told apart [rad/s]."""
+    """Nominal speed of turning, by which the right one of two poses is chosen [rad/s]."""
     acceleration: float = 0.3
-    """Acceleration that is taken for normal [m/s^2]; impacts are outliers."""
+    """Nominal acceleration [m/s^2]; impacts are outliers."""
     angular_acceleration: float = 3.0
     """The same for rotations [rad/s^2]."""
     least_noise: float = 0.05
-    """Corners are not taken for more certain than this [pixel]."""
+    """Least standard deviation of a corner [pixel]."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -73,7 +73,7 @@ class Track:
     covariance: Float[np.ndarray, "frame 6 6"]
     """Covariance of rotation and position: a small turn about the camera's axes [rad], then metres."""
     noise: float
-    """How precisely the corners were seen, in the recording's own judgement [pixel]."""
+    """Standard deviation of the corners, estimated from the recording [pixel]."""
 
     def gaps(self) -> list[tuple[float, float]]:
         """Beginning and end of each stretch without a pose [s]."""
@@ -142,18 +142,23 @@ def track(
     return Track(times, poses, seen & ~strange, errors, covariance, float(np.median(noise)))
 
 
-def check_times(times: Float[np.ndarray, " frame"]) -> None:
+def check_times(times: Float[np.ndarray, " frame"], of: str = "") -> None:
     """Refuse time stamps that do not increase.
+
+    Args:
+        times: Time stamps [s].
+        of: What they belong to, for the message.
+
 
     Raises:
         PerceptionError: Naming the first frame that is not later than the one before.
     """
     if not np.isfinite(times).all():
-        raise PerceptionError(f"frame {int((~np.isfinite(times)).argmax())} has no time stamp")
+        raise PerceptionError(f"frame {int((~np.isfinite(times)).argmax())}{of} has no time stamp")
     if (np.diff(times) <= 0).any():
         k = int((np.diff(times) <= 0).argmax())
         raise PerceptionError(
-            f"time stamps do not increase: frame {k + 1} at {times[k + 1]:.6f} s follows {times[k]:.6f} s; "
+            f"time stamps{of} do not increase: frame {k + 1} at {times[k + 1]:.6f} s follows {times[k]:.6f} s; "
             "sort or record again"
         )
 

@@ -25,9 +25,9 @@ from foretrace.perception.masks import DEPTH_RIM
 GRID = 0.00025
 """Side of a pixel of the rectified mask [m]."""
 TOLERANCE = 0.002
-"""How far the polygon may leave the outline [m]: less would follow the noise of its edge, and so would directions."""
+"""Largest distance of the polygon from the outline [m]: less follows the noise of the edge."""
 BLUNTED = 3.0
-"""How much of a right-angled corner a lens may take [pixel]."""
+"""Length that a lens may take from a right-angled corner [pixel]."""
 SMOOTHING = 1.0
 """Standard deviation by which the steps of a mask's border are smoothed [pixel]."""
 LARGEST_OBJECT = 1.0
@@ -53,7 +53,7 @@ class PlacedObject:
 
 @dataclass(frozen=True)
 class Observation:
-    """What a predictor needs to know of an image."""
+    """Object, lever-up and view in an image."""
 
     placed: PlacedObject
     """The object on the table."""

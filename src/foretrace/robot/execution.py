@@ -21,11 +21,11 @@ from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
 
 LAG = 0.3
-"""The arm is compared with the set points of so long [s]: it follows them with a delay."""
+"""Time over which set points are compared with the arm, which follows them with a delay [s]."""
 SETTLE = 0.3
 """How long the last set point is held [s]."""
 STILL = 0.005
-"""Largest turn of a joint while somebody decides whether the arm may move [rad]."""
+"""Largest turn of a joint between check and motion [rad]."""
 FULL_SPEED = 0.99
 """Least speed scaling of the controller; below, the arm would fall behind its set points."""
 
@@ -115,7 +115,7 @@ def execute(
         out: CSV file to record to; must not be there.
         limits: Limits of the way to the start.
         watch: When to give up.
-        confirm: Told the checks of the way to the start; only if it says yes does the arm move.
+        confirm: Whether the arm may move, from the checks of its way to the start.
         video: Recorder that films the motion.
 
     Raises:

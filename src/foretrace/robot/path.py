@@ -134,7 +134,7 @@ def _knots(duration: float) -> Float[np.ndarray, " time"]:
 
 
 def _minimum_jerk(num: int) -> Float[np.ndarray, " {num}"]:
-    """From 0 to 1 in so many samples, at rest at both ends."""
+    """Progress from 0 to 1, at rest at both ends."""
     s = np.linspace(0, 1, num)
     return s**3 * (10 - 15 * s + 6 * s**2)
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from foretrace.geometry import matrix_to_quaternion
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.simulation.camera import make_renderer
+from foretrace.simulation.camera import make_renderer, render
 
 WEBCAM = PinholeCamera(1280, 720, 921.0, 922.5, 648.0, 351.0, distortion=(0.09, -0.21, 0.0008, -0.0006, 0.11))
 """About what the colour camera of a depth camera has: 70 x 43 degrees, a lens of its time."""
@@ -29,7 +29,7 @@ class Faults:
     noise: float = 2.0
     """Standard deviation of the noise of each colour [of 255]."""
     flicker: float = 0.15
-    """Largest change of the light over a film, as a part of it; it also falls off over the image by that."""
+    """Largest change of the light over a recording, as a part of it; it also falls off over the image by that."""
     depth_noise: float = 1.0
     """Scale of the depth noise that Nguyen et al. (2012) measured on a Kinect."""
     depth_holes: float = 0.01
@@ -68,10 +68,10 @@ class LensCamera:
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         # MuJoCo's camera has y up and looks along -z.
         turned = matrix_to_quaternion(T_world_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
-        spec.worldbody.add_camera(name="film", pos=T_world_camera[:3, 3], quat=turned)
+        spec.worldbody.add_camera(name="lens", pos=T_world_camera[:3, 3], quat=turned)
         self.camera, self.model, self._lamp = camera, spec.compile(), lamp
         """Intrinsics, and the compiled scene."""
-        self.model.cam_fovy[self.model.camera("film").id] = np.rad2deg(2 * np.arctan(height / 2 / camera.fy))
+        self.model.cam_fovy[self.model.camera("lens").id] = np.rad2deg(2 * np.arctan(height / 2 / camera.fy))
         self.data = mujoco.MjData(self.model)
         """State of the scene."""
         self._renderer = make_renderer(self.model, height, width)
@@ -84,31 +84,20 @@ class LensCamera:
 
     def colours(self) -> Float[np.ndarray, "rows columns 3"]:
         """The scene as it is: blue, green, red, bent by the lens and without noise."""
-        if self._lamp is None:
-            self._update()
-            rgb = self._renderer.render().astype(np.float32)
-        else:
-            rgb = np.mean([self._lit_from(point) for point in self._lamp], axis=0)
-        return self._bend(rgb[..., ::-1], cv2.INTER_LINEAR)
+        lit = [self._render()] if self._lamp is None else [self._lit_from(point) for point in self._lamp]
+        return self._bend(np.mean(lit, axis=0)[..., ::-1], cv2.INTER_LINEAR)
 
     def _lit_from(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows columns 3"]:
         self.model.light_pos[0] = point
-        self._update(shadows=True)
-        return self._renderer.render().astype(np.float32)
+        return self._render(shadows=True)
 
     def depths(self) -> Float[np.ndarray, "rows columns"]:
         """Distance along the optical axis [m], without noise."""
-        self._update()
-        self._renderer.enable_depth_rendering()
-        depth = self._renderer.render().astype(np.float32)
-        self._renderer.disable_depth_rendering()
-        return self._bend(depth, cv2.INTER_NEAREST).astype(float)
+        return self._bend(self._render(depth=True), cv2.INTER_NEAREST).astype(float)
 
-    def _update(self, shadows: bool = False) -> None:
+    def _render(self, **what: bool) -> np.ndarray:
         mujoco.mj_forward(self.model, self.data)
-        self._renderer.update_scene(self.data, camera="film")
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        return render(self._renderer, self.data, "lens", **what).astype(np.float32)
 
     def _bend(self, image: np.ndarray, interpolation: int) -> Any:
         return cv2.remap(image, self._maps[0], self._maps[1], interpolation)

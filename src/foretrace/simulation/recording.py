@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
 from foretrace.files import write_json
-from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
+from foretrace.geometry import invert_transform, matrix_to_pose, planar_transform, pose_to_matrix
 from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
@@ -78,7 +78,7 @@ class RecordingConfig:
     exposures: int = 2
     """Moments within a hundredth of a second that are blended into one frame: motion blur."""
     depth_every: int = 1
-    """Depth is recorded with every so many colour frames; 0: never."""
+    """Colour frames from one with depth to the next; 0: no depth."""
     faults: Faults = field(default_factory=Faults)
     """What spoils the images."""
     shadows: bool = False
@@ -379,9 +379,7 @@ def _background(
 def _place(lens: LensCamera, obj: ObjectModel, motion: Motion, time: float) -> None:
     """Puts object and tool where they are at a time since the path's start."""
     pose, tool = (poses[0] for poses in _interpolate(motion, np.array([time])))
-    T_object_body = np.eye(4)
-    T_object_body[:3, 3] = body_origin(obj)
-    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ T_object_body)
+    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(obj), 0.0))
     if motion.joints.shape[1]:
         joints = [np.interp(time, motion.times, joint) for joint in motion.joints.T]
     else:
