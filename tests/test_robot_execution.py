@@ -31,6 +31,10 @@ LEG = ArmPath("lever-up", START + np.linspace(0, 0.2, NUM)[:, None] * np.array([
 PATIENT, WATCH = WatchConfig(timeout=1.5), WatchConfig(timeout=0.5)
 """Longer than the default: the tests' machine may be busy."""
 BACK = ArmPath("set-down", LEG.joints[::-1])
+BRIEF = 30
+STEP = ArmPath("lever-up", LEG.joints[:BRIEF])
+STEP_BACK = ArmPath("set-down", STEP.joints[::-1])
+"""Long enough for everything that goes well."""
 HALF = 30
 
 
@@ -65,33 +69,41 @@ def test_a_lever_up_is_executed(kinematics, recording):
     seen = []
     away = START + np.array([0, 0, 0.004, 0, 0, 0])
     with RunningController(away) as controller:
-        go(controller.host, kinematics, recording, lambda checks: bool(seen.append(checks)) or True)
+        go(
+            controller.host,
+            kinematics,
+            recording,
+            lambda checks: bool(seen.append(checks)) or True,
+            legs=(STEP,),
+        )
     facts, rows = controller.facts, read(recording)
     assert {check.leg for check in seen[0]} == {"approach"}
     assert facts.uploads == 1
     assert facts.stops == ["servo", "program"]
-    np.testing.assert_allclose(facts.joints, LEG.joints[-1], atol=1e-4)
+    np.testing.assert_allclose(facts.joints, STEP.joints[-1], atol=1e-4)
     # Every set point arrives, in order.
     hold = round(SETTLE / CONTROL_PERIOD)
-    np.testing.assert_allclose(facts.set_points[-NUM - hold : -hold], LEG.joints, atol=1e-12)
+    np.testing.assert_allclose(facts.set_points[-BRIEF - hold : -hold], STEP.joints, atol=1e-12)
     np.testing.assert_allclose(facts.set_points[0], away, atol=1e-12)
     assert len(rows) == len(facts.set_points)
     assert {row["leg"] for row in rows} == {"approach", "lever-up", "hold"}
     assert np.all(np.diff([float(row["time_s"]) for row in rows]) >= 0)
     last = [float(rows[-1][name]) for name in rows[-1] if name.endswith(("pan_rad", "wrist_1_rad"))]
-    np.testing.assert_allclose(last, LEG.joints[-1, [0, 3]], atol=1e-3)
+    np.testing.assert_allclose(last, STEP.joints[-1, [0, 3]], atol=1e-3)
     assert {(row["robot_mode"], row["safety_mode"]) for row in rows} == {("7", "1")}
 
 
 def test_the_way_back_follows_and_is_recorded(kinematics, recording):
     with RunningController(START) as controller:
-        go(controller.host, kinematics, recording, legs=(LEG, BACK))
+        go(controller.host, kinematics, recording, legs=(STEP, STEP_BACK))
     hold = round(SETTLE / CONTROL_PERIOD)
-    np.testing.assert_allclose(controller.facts.set_points[-NUM - hold : -hold], BACK.joints, atol=1e-12)
+    np.testing.assert_allclose(
+        controller.facts.set_points[-BRIEF - hold : -hold], STEP_BACK.joints, atol=1e-12
+    )
     np.testing.assert_allclose(controller.facts.joints, START, atol=1e-4)
     legs = [row["leg"] for row in read(recording)]
     assert list(dict.fromkeys(legs)) == ["approach", "lever-up", "set-down", "hold"]
-    assert legs.count("set-down") == NUM
+    assert legs.count("set-down") == BRIEF
 
 
 class PacedCamera:
@@ -123,7 +135,7 @@ def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording,
     film = VideoRecorder(str(video), folder)
     monkeypatch.setattr(film, "_capture", PacedCamera(video))
     with RunningController(START) as controller:
-        go(controller.host, kinematics, recording, film=film, legs=(LEG, BACK))
+        go(controller.host, kinematics, recording, film=film, legs=(STEP, STEP_BACK))
     with (folder / "timestamps.csv").open(newline="") as file:
         frames = list(csv.DictReader(file))
     times, rows = [float(frame["time_s"]) for frame in frames], read(recording)

@@ -150,11 +150,18 @@ def _lay_out(
 ) -> Bool[np.ndarray, "rows columns"]:
     """A mask laid onto the plane at a height: x to the right, y up, pixels of `GRID`."""
     width, length = (int(n) for n in size)
-    x = low[0] + GRID * (np.arange(width) + 0.5)
-    y = low[1] + GRID * (np.arange(length)[::-1] + 0.5)
-    points = np.stack([*np.meshgrid(x, y), np.full((length, width), height)], axis=-1).reshape(-1, 3)
-    pixels = camera.project(points, invert_transform(T_table_camera)).astype(np.float32)
-    columns, rows = pixels.T.reshape(2, length, width)
+    T_camera_table = invert_transform(T_table_camera)
+    # From (column, row, 1) of the grid to points in the table frame, then in the camera frame.
+    grid = [
+        [GRID, 0.0, low[0] + 0.5 * GRID],
+        [0.0, -GRID, low[1] + GRID * (length - 0.5)],
+        [0.0, 0.0, height],
+    ]
+    rays = T_camera_table[:3, :3] @ np.array(grid)
+    rays[:, 2] += T_camera_table[:3, 3]
+    columns, rows = cv2.initUndistortRectifyMap(
+        camera.matrix, camera.coefficients, np.eye(3), np.linalg.inv(rays), (width, length), cv2.CV_32FC1
+    )
     return cv2.remap(mask, columns, rows, cv2.INTER_LINEAR) >= 0.5
 
 
