@@ -193,6 +193,7 @@ def predict(
     from foretrace.actions import Stroke
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
     from foretrace.interactions.record import Physics
+    from foretrace.interactions.recording_folder import write_image
     from foretrace.perception.photo import PhotoConfig, open_photo
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import Scene, scene_figure
@@ -255,7 +256,7 @@ def predict(
     _write_trajectory(out, run, obj, action, imagined, truth)
     scene_figure(scene).savefig(out / "prediction.png")
     if seen is not None:
-        seen.save_overlay(out / "overlay.png", imagined.com_trajectory, radius_of(imagined))
+        write_image(out / "overlay.png", seen.overlay(imagined.com_trajectory, radius_of(imagined)))
     if animation:
         scene_animation(scene, out / "prediction.gif")
     if truth is not None:
