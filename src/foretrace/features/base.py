@@ -31,6 +31,10 @@ Precision = Literal["float32", "bfloat16"]
 """Number format of the convolutions during training."""
 
 
+ImageName = Literal["mask", "height"]
+"""An image of the view."""
+
+
 @dataclass(frozen=True)
 class FitPart:
     """One part of the data as a feature extractor's own training sees it."""
@@ -44,7 +48,7 @@ class FitPart:
 class TracedFeatures(nn.Module, ABC):
     """A feature extractor as a part of an exported network, which reads an image of the view."""
 
-    name: Literal["mask", "height"]
+    name: ImageName
     """The image that it reads."""
     meaning: str
     """What that is, for whoever reads the file."""

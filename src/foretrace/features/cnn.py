@@ -1,14 +1,15 @@
 """Convolutional features, trained together with the predictor (paper, section 3.3)."""
 
 from itertools import pairwise
-from typing import Literal, TypeVar
+from typing import TypeVar, get_args
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features.base import FeatureExtractor, Option, TracedFeatures
+from foretrace.errors import TrainingError
+from foretrace.features.base import FeatureExtractor, ImageName, Option, TracedFeatures
 from foretrace.features.shape_context import ShapeContext3200, shape_contexts
 from foretrace.features.windows import convolve_unbranched, convolve_windows
 from foretrace.interactions.dataset import InteractionBatch
@@ -105,9 +106,11 @@ class ImageCnn(ConvolutionalFeatures):
 
     label = "im-cnn"
 
-    def __init__(self, channel: Literal["mask", "height"] = "mask", width: int = 128, dropout: float = 0.2):
+    def __init__(self, channel: ImageName = "mask", width: int = 128, dropout: float = 0.2):
+        if channel not in get_args(ImageName):
+            raise TrainingError(f"channel is {channel!r}: choose from {', '.join(get_args(ImageName))}")
         super().__init__(8 * 8 * CHANNELS[-1], width, dropout, channel=channel)
-        self.channel = channel
+        self.channel: ImageName = channel
 
     def inputs(self, batch: InteractionBatch) -> Shaped[Tensor, "batch 1 128 128"]:
         """The masks as bytes (0 or 1), or the height maps in units of 10 cm."""

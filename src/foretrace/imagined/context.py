@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import USUAL_STROKE, LeverUp, Stroke
+from foretrace.actions import USUAL_STROKE, LeverUp
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -59,9 +59,11 @@ def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]
     return getattr(batch, name)
 
 
-def true_context(physics: Physics, names: Sequence[str], stroke: Stroke = USUAL_STROKE) -> dict[str, float]:
-    """True values of one interaction's context, in SI units, by the given names."""
-    values = asdict(physics) | asdict(stroke)
+def true_context(
+    physics: Physics, names: Sequence[str], parameters: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """True values of one interaction's context, in SI units, by the given names; those of the nominal path by default."""
+    values = asdict(physics) | dict(nominal_parameters() if parameters is None else parameters)
     return {name: values[name] for name in names}
 
 

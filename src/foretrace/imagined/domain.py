@@ -139,7 +139,7 @@ def check_contacts(
 def _rim(mask: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "k 2"]:
     """Middles of the outermost pixels of a mask [m]."""
     kept = mask.view(np.uint8)
-    inner = cv2.erode(kept, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner = np.asarray(cv2.erode(kept, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT, borderValue=0))
     return (CONTACT_PIXEL - np.argwhere(kept > inner)) * METRES_PER_PIXEL
 
 

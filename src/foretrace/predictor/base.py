@@ -280,11 +280,12 @@ class EffectPredictor(Imaginer, nn.Module):
     def add_context(
         self,
         features: Float[Tensor, "batch features"],
-        values: Float[np.ndarray, "batch context"] | Float[Tensor, "batch context"],
+        values: Float[np.ndarray, "batch context"] | Float[Tensor, "batch context"] | None,
     ) -> Float[Tensor, "batch inputs"]:
         """Inputs of the network: features of objects, and behind them the context, standardised."""
         if not self.context:
             return features
+        assert values is not None
         context = torch.as_tensor(values, dtype=torch.float32, device=self.device)
         return torch.cat([features, (context - self.known_mean) / self.known_scale], dim=1)
 

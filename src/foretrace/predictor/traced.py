@@ -51,10 +51,6 @@ class TracedPredictor(nn.Module, ABC):
         times, context = self.predictor.times.tolist(), list(self.predictor.context)
         return {"frame": FRAME, "units": "SI", "times": times, "context": context}
 
-    def add_context(self, features: Tensor, context: Tensor | None) -> Tensor:
-        """As `EffectPredictor.add_context`, where there is any."""
-        return features if context is None else self.predictor.add_context(features, context)
-
 
 class TracedDistribution(TracedPredictor):
     """The one-shot predictor: from outlines to all futures."""
@@ -78,7 +74,7 @@ class TracedDistribution(TracedPredictor):
 
     def forward(self, features: Tensor, com: Tensor, context: Tensor | None = None) -> tuple[Tensor, ...]:
         """The distribution."""
-        mixture = self.predictor.mixture(self.add_context(features, context), com)
+        mixture = self.predictor.mixture(self.predictor.add_context(features, context), com)
         states, outcomes = mixture.states(), mixture.log_probability.shape[2]
         ends = mixture.ends[:, :, None].expand(-1, -1, outcomes, -1, -1).flatten(1, 2)
         probability = mixture.log_probability.flatten(1).exp()
@@ -131,7 +127,7 @@ class TracedTrajectory(TracedPredictor):
         features = source if self.features is None else self.features(source)
         first = torch.cat([com, self.unturned.expand(com.shape[0], -1)], dim=1)
         start = (first - predictor.state_mean) / predictor.state_scale
-        rolled = predictor.roll_out(self.add_context(features, context), start)
+        rolled = predictor.roll_out(self.predictor.add_context(features, context), start)
         states = rolled * predictor.state_scale + predictor.state_mean
         states = torch.cat([first[:, None], states[:, 1:]], dim=1)
         if predictor.state == "position":
