@@ -26,18 +26,12 @@ def train(
     out: Path,
     predictor: str = "lstm",
     features: str | None = None,
-    heights: bool | None = None,
+    heights: bool = False,
     context: tuple[str, ...] | None = None,
     state: Literal["position", "pose", "turn"] | None = None,
     steps_ahead: int | None = None,
     hidden: int | None = None,
-    window: int | None = None,
-    residual: bool | None = None,
-    layers: int | None = None,
-    ensemble: int | None = None,
     components: int | None = None,
-    pivot_edges: int | None = None,
-    mirrored: bool | None = None,
     epochs: int | None = None,
     batch_size: int | None = None,
     learning_rate: float | None = None,
@@ -64,13 +58,7 @@ def train(
         state: Predict the centre of mass, or the whole pose (lstm).
         steps_ahead: States predicted per iteration, n in the paper (lstm).
         hidden: Units of the LSTM, by default 256; or of each layer of the one-shot predictor, by default 128.
-        window: States per training sequence (lstm).
-        residual: Predict changes of the state (lstm).
-        layers: Hidden layers (one-shot).
-        ensemble: Size of the ensemble (one-shot).
         components: Components of the PCA basis of trajectories (one-shot).
-        pivot_edges: Candidate pivot edges, 1 or 2 (one-shot).
-        mirrored: See every lever-up in the mirror, too (one-shot).
         epochs: Passes over the training part; more where it is small, for 300 optimiser steps at least. By default 15
             for lstm, 150 for one-shot.
         batch_size: Trajectories per optimiser step.
@@ -92,9 +80,8 @@ def train(
 
     config_class = PREDICTORS.find(predictor).config_class
     chosen: dict[str, Any] = {"features": features, "context": context, "state": state, "hidden": hidden}
-    chosen |= {"steps_ahead": steps_ahead, "window": window, "residual": residual, "layers": layers}
-    chosen |= {"ensemble": ensemble, "components": components, "pivot_edges": pivot_edges}
-    chosen |= {"mirrored": mirrored, "feature_options": None if heights is None else {"heights": heights}}
+    chosen |= {"steps_ahead": steps_ahead, "components": components}
+    chosen["feature_options"] = {"heights": True} if heights else None
     names = [field.name for field in fields(config_class)]
     if "outcomes" in names:
         chosen["outcomes"] = outcomes
@@ -173,7 +160,7 @@ def predict(
         shadows: Whether the object may cast shadows, which --mask background then tells from it.
         box: Left, top, width and height of a box round the object, for --mask grabcut.
         hull: Take the convex hull of the outline in the photograph, as the paper does.
-        friction: Friction coefficient between object and table, for a predictor that is conditioned on it and for --compare.
+        friction: Friction coefficient between object and table, for a predictor conditioned on it and for --compare.
         tool_friction: Friction coefficient between object and blade, likewise.
         density: Density of the object [kg/m^3], likewise.
         insertion: How far the blade goes under the object [m], likewise.
@@ -263,7 +250,9 @@ def _told_values(given: dict[str, float | None], knows: tuple[str, ...], simulat
         if value is not None and not 0 < value < float("inf"):
             raise PredictionError(f"{option} is {value}: give a number above 0")
         if value is not None and name not in knows and not simulated:
-            raise PredictionError(f"the predictor is not conditioned on {name}: leave {option} out, or --compare")
+            raise PredictionError(
+                f"the predictor is not conditioned on {name}: leave {option} out, or --compare"
+            )
     return told
 
 

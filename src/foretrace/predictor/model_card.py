@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from foretrace.errors import TrainingError
-from foretrace.files import flatten, read_json
+from foretrace.files import as_json, flatten, read_json
 from foretrace.imagined import LEVELS, STARTS, conformal_scores
 from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
@@ -27,7 +27,7 @@ CM = 100.0
 RUNTIME_OPTIONS = ("min_steps", "device", "precision", "threads")
 """Settings of a training that the card's command leaves at their defaults."""
 LIMITS = """\
-- It imagines one action, the lever-up, with the tool path of its data, and rigid objects that lie alone on a flat table.
+- It imagines lever-ups with the tool path of its data, on rigid objects that lie alone on a flat table.
 - It has learned from simulation. How far a real object is from it is not part of this card.
 - Probabilities and regions hold for lever-ups like those in the data: an object that is unlike them is pointed out, an
   unlike friction, density, rim or tool is not.
@@ -70,8 +70,9 @@ def _about(predictor: EffectPredictor) -> str:
     outcomes = f", distinguishes {', '.join(predictor.outcomes)}" if predictor.outcomes else ""
     imagined = "the centre of mass" if predictor.state == "position" else "the pose"
     return (
-        f"Imagines {imagined} of a levered object from the view from above: {len(times)} samples in {times[-1]:.2f} s, in "
-        f"the action frame, SI units{context}{outcomes}. {sum(p.numel() for p in predictor.parameters())} weights."
+        f"Imagines {imagined} of a levered object from the view from above: {len(times)} samples in "
+        f"{times[-1]:.2f} s, in the action frame, SI units{context}{outcomes}. "
+        f"{sum(p.numel() for p in predictor.parameters())} weights."
     )
 
 
@@ -90,20 +91,21 @@ def _data(
 
 
 def _training(run: Path, data: Path) -> str:
-    content = read_config(run)
-    training, config = content["training"], flatten({"feature_options": {}} | content["config"])
-    command = [f"foretrace train --data {data} --out {run} --predictor {content['predictor']}"]
-    options = {name.removeprefix("feature_options."): value for name, value in config.items()}
+    content, predictor = read_config(run), load_predictor(run)
+    usual = flatten(as_json(asdict(type(predictor.config)())))
+    options = {
+        name.removeprefix("feature_options."): value
+        for name, value in flatten(content["config"]).items()
+        if value != usual.get(name)
+    }
+    training = content["training"]
     options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
+    command = [f"foretrace train --data {data} --out {run} --predictor {predictor.label}"]
     for name, value in options.items():
-        option = name.replace("_", "-")
-        if name in RUNTIME_OPTIONS or value is None or value == [] or value == {}:
+        if name in RUNTIME_OPTIONS or value is None or value is False:
             continue
-        if isinstance(value, bool):
-            command.append(f"--{'' if value else 'no-'}{option}")
-        else:
-            values = value if isinstance(value, list) else [value]
-            command.append(f"--{option} {' '.join(map(str, values))}")
+        values = [] if value is True else value if isinstance(value, list) else [value]
+        command.append(" ".join([f"--{name.replace('_', '-')}", *map(str, values)]))
     environment = read_json(run / ENVIRONMENT, TrainingError, "give the whole folder of a training")
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return (
