@@ -11,12 +11,12 @@ from foretrace.interactions.record import Physics
 from foretrace.simulation import arm
 from foretrace.simulation.mujoco_engine import plan_control, tip_transforms
 from foretrace.simulation.scene import build_scene
-from foretrace.simulation.tool import Tool
+from foretrace.actions import Screwdriver
 
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return build_scene(None, Physics(), Tool(), "arm", 0.002).compile()
+    return build_scene(None, Physics(), Screwdriver(), "arm", 0.002).compile()
 
 
 def flange_in_base(model: mujoco.MjModel, q: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def test_unreachable_pose_is_refused(model: mujoco.MjModel) -> None:
 
 def test_too_fast_a_path_is_refused() -> None:
     with pytest.raises(ActionError, match="over its limit"):
-        plan_control(ToolPath(lift_time=0.06), Tool(), "arm", 0.002, 0.05)
+        plan_control(ToolPath(lift_time=0.06), Screwdriver(), "arm", 0.002, 0.05)
 
 
 def test_the_arm_keeps_clear_of_the_table(model: mujoco.MjModel) -> None:

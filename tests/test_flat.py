@@ -21,7 +21,7 @@ from foretrace.objects import (
 )
 from foretrace.objects.flat import HALF_LENGTHS, HEIGHTS
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.tool import Tool
+from foretrace.actions import Screwdriver
 
 FAMILIES = (sample_oval, sample_rounded, sample_organic, sample_dented)
 WATCHED = SimulationConfig(embodiment="tool", watch_time=1.5)
@@ -60,7 +60,7 @@ def test_ovals_and_rounded_ones_are_convex_dented_ones_are_not():
 
 
 def test_contacts_spread_over_the_outline_where_a_blade_gets():
-    half = Tool().blade_width / 2
+    half = Screwdriver().blade_width / 2
     for obj in draw(sample_dented, 8):
         actions = sample_reachable_contacts(obj, np.random.default_rng(1), 40)
         outline = shapely.Polygon(obj.corners)

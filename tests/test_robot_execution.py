@@ -18,7 +18,7 @@ from foretrace.robot.filming import Filming
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath
 from foretrace.simulation.arm import CONTROL_PERIOD
-from foretrace.simulation.tool import Tool
+from foretrace.actions import Screwdriver
 from ur_controller import RunningController
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde: pip install 'foretrace[ur]'")
@@ -36,7 +36,7 @@ HALF = 30
 
 @pytest.fixture(scope="module")
 def kinematics() -> ArmKinematics:
-    return ArmKinematics(Tool())
+    return ArmKinematics(Screwdriver())
 
 
 @pytest.fixture

@@ -185,7 +185,7 @@ def predict(
     """
     from dataclasses import replace
 
-    from foretrace.actions import Stroke
+    from foretrace.actions import ToolPath
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
     from foretrace.interactions.record import Physics
     from foretrace.pictures.animation import scene_animation
@@ -227,9 +227,9 @@ def predict(
     name = f"{predictor.features.label} + LSTM" if predictor.label == "lstm" else predictor.label
     paths = {name: imagined.com_trajectory}
     physics = Physics(**{name: told[name] for name in constants if name in told})
-    stroke = Stroke(**{name: told[name] for name in parameters if name in told})
-    simulation = SimulationConfig(physics=physics, path=stroke.path())
-    truth = simulate_lever_up(obj, action, simulation) if compare else None
+    path = ToolPath.of(**{name: told[name] for name in parameters if name in told})
+    action = replace(action, path=path)
+    truth = simulate_lever_up(obj, action, SimulationConfig(physics=physics)) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
         title = f"Predicted and simulated lever-up: {truth.effect.outcome}"
         scene = replace(Scene.observed(truth, paths), title=title)

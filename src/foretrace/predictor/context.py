@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import USUAL_STROKE, Stroke
+from foretrace.actions import LeverUp
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -23,7 +23,7 @@ PARAMETERS = {
     "sweep": "in rad",
     "speed": "as a multiple of the usual one",
 }
-"""What can be known of the action, by the names of `Stroke`."""
+"""What can be known of the action, by the names of its parameters."""
 KNOWN = CONSTANTS | PARAMETERS
 """What can be known."""
 
@@ -48,7 +48,9 @@ def observed_values(batch: InteractionBatch, names: Sequence[str]) -> Float[np.n
     Raises:
         PredictionError: One of them lacks a value.
     """
-    values = np.array([getattr(batch, name) for name in names], dtype=float).reshape(len(names), len(batch)).T
+    values = (
+        np.array([batch.parameters[name] for name in names], dtype=float).reshape(len(names), len(batch)).T
+    )
     rows, columns = np.nonzero(~np.isfinite(values))
     if len(rows):
         name = names[columns[0]]
@@ -59,9 +61,11 @@ def observed_values(batch: InteractionBatch, names: Sequence[str]) -> Float[np.n
     return values
 
 
-def true_values(physics: Physics, names: Sequence[str], stroke: Stroke = USUAL_STROKE) -> dict[str, float]:
+def true_values(
+    physics: Physics, names: Sequence[str], parameters: Mapping[str, float] | None = None
+) -> dict[str, float]:
     """What holds of one lever-up, in SI units, by the given names."""
-    values = asdict(physics) | asdict(stroke)
+    values = asdict(physics) | dict(parameters or LeverUp.nominal_parameters())
     return {name: values[name] for name in names}
 
 
