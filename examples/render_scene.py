@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 
 import foretrace as ft
+from foretrace.actions import Screwdriver
 from foretrace.simulation.camera import make_renderer
 from foretrace.simulation.scene import build_scene
-from foretrace.actions import Screwdriver
 
 HEIGHT, WIDTH = 420, 560
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli import main
 from foretrace.errors import SimulationError
 from foretrace.interactions.dataset import Dataset
@@ -18,7 +18,6 @@ from foretrace.simulation.bullet_engine import BulletEngine
 from foretrace.simulation.bullet_world import COLLISION_MARGIN, World, connect
 from foretrace.simulation.free_motion import simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.actions import Screwdriver
 
 pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
 
@@ -133,7 +132,9 @@ def test_an_object_that_is_not_convex_is_levered_as_in_mujoco(capfd: pytest.Capt
 
 def test_a_sharp_rim_is_pushed_and_not_lifted() -> None:
     blunt = Prism(SQUARE.corners, bevel=NO_BEVEL)
-    motion = BulletEngine().play(blunt, LeverUp.at_edge(blunt, 0), ToolPath(pitch=0.0), Screwdriver(), Physics())
+    action = LeverUp.at_edge(blunt, 0, path=ToolPath(pitch=0.0))
+    pose = action.T_action_object
+    motion = BulletEngine().play(blunt, pose, action.tool, action.tool_motion, action.duration, Physics())
     assert motion.object_pose[20, 0] - motion.object_pose[0, 0] > 0.01
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foretrace import cli
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.errors import RobotError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.record import Physics
@@ -22,7 +22,6 @@ from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, plan_ret
 from foretrace.simulation import arm
 from foretrace.simulation.engine import tip_transforms
 from foretrace.simulation.scene import build_scene
-from foretrace.actions import Screwdriver
 from ur_controller import RunningController
 
 ACTION = LeverUp((0.1, 0.2), (0.6, 0.8))

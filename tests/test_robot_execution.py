@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from foretrace.actions import Screwdriver
 from foretrace.errors import RobotError
 from foretrace.interactions.film_folder import FilmNotes
 from foretrace.robot.checks import ArmLimits
@@ -18,7 +19,6 @@ from foretrace.robot.filming import Filming
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath
 from foretrace.simulation.arm import CONTROL_PERIOD
-from foretrace.actions import Screwdriver
 from ur_controller import RunningController
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde: pip install 'foretrace[ur]'")

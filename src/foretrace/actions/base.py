@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Self, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import numpy as np
 import shapely
@@ -24,6 +24,7 @@ CONTACT_TOLERANCE = 0.005
 UNIT_TOLERANCE = 1e-9
 """A stored direction differs from unit length by less than this."""
 
+Placed = TypeVar("Placed", bound="Action")
 ACTIONS: Registry[type["Action"]] = Registry("action", "foretrace.actions", ActionError)
 """Every action by its label."""
 
@@ -117,7 +118,9 @@ class Action(ABC):
         return cls((0.0, 0.0), (1.0, 0.0)).parameters()  # pyright: ignore[reportCallIssue]
 
     @classmethod
-    def at_edge(cls, obj: ObjectModel, edge: int, fraction: float = 0.5, **settings: Any) -> Self:
+    def at_edge(
+        cls: type[Placed], obj: ObjectModel, edge: int, fraction: float = 0.5, **settings: Any
+    ) -> Placed:
         """The action at a fraction of an edge, along its inward normal.
 
         Args:
@@ -138,7 +141,7 @@ class Action(ABC):
         return cls(start + fraction * (stop - start), inward_normals(obj.corners)[edge], **settings)
 
     @classmethod
-    def nearest(cls, obj: ObjectModel, point: Numbers, **settings: Any) -> Self:
+    def nearest(cls: type[Placed], obj: ObjectModel, point: Numbers, **settings: Any) -> Placed:
         """The action at the point of the outline nearest to a given one, along that edge's inward normal.
 
         Near a corner the contact keeps a millimetre from it (or half of a shorter edge), on the edge that
@@ -177,7 +180,7 @@ class Action(ABC):
                 f"take {name}.nearest or {name}.at_edge"
             )
 
-    def moved(self, ahead: float, left: float, turn: float) -> Self:
+    def moved(self: Placed, ahead: float, left: float, turn: float) -> Placed:
         """The action shifted along its direction and to its left [m], then turned to the left [rad]."""
         x, y = self.direction
         contact = self.contact + ahead * np.array([x, y]) + left * np.array([-y, x])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from foretrace.actions import FAILED
+from foretrace.actions import FAILED, ToolPath
 from foretrace.errors import ActionError, DatasetError
 from foretrace.files import partial_files, sole_writer
 from foretrace.interactions import storage
@@ -147,11 +147,14 @@ def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Findin
     columns = {column: table[column].to_numpy() for column in ranges if column in table.column_names}
     try:
         columns |= storage.parameter_values(table)
-    except ActionError:
+        nominal = ToolPath(**manifest["configuration"].get("path", {})).parameters()["speed"]
+    except (ActionError, TypeError):
         return  # reported with the numbers
     for column in ranges.keys() & columns.keys():
         drawn, values = ranges[column], columns[column]
         low, high = (-drawn, drawn) if isinstance(drawn, int | float) else drawn
+        if column == "speed":  # drawn as a multiple of the configured path's
+            values = np.round(values / nominal, 9)
         for row in np.flatnonzero((values < low) | (values > high)):
             who = f"interaction {table['id'][int(row)]}"
             yield Finding(name, f"{who}: {column} = {values[row]:g} was not drawn from {low:g} to {high:g}")

@@ -65,8 +65,9 @@ def upgrade(path: str | Path) -> int:
         objects: dict[str, int] = {}
         shards, rows = {}, 0
         for name in names:
-            table = _converted(path, name, manifest)
-            shards[name] = storage.write_shard(path, name, table)
+            table, content = _converted(path, name, manifest)
+            entry = content and storage.shard_entry(content, table)
+            shards[name] = entry or storage.write_shard(path, name, table)
             rows += table.num_rows
             objects |= dict(zip(table["object"].to_pylist(), table["object_id"].to_pylist(), strict=True))
         configuration = _configuration(manifest["configuration"])
@@ -79,18 +80,18 @@ def upgrade(path: str | Path) -> int:
     return rows
 
 
-def _converted(folder: Path, name: str, manifest: Mapping[str, Any]) -> pa.Table:
-    """A shard in today's form; one that an interrupted upgrade has converted already, as it is."""
+def _converted(folder: Path, name: str, manifest: Mapping[str, Any]) -> tuple[pa.Table, bytes | None]:
+    """A shard in today's form, and its bytes if an interrupted upgrade has written it already."""
     remedy = (
         f"remove the file, upgrade, and `foretrace simulate` makes it again; or restore {folder} from a copy"
     )
-    table, _ = storage.read_shard(folder, name, schema=None)
+    table, content = storage.read_shard(folder, name, schema=None)
     if table.schema.equals(storage.SCHEMA):
-        return table
+        return table, content
     storage.read_shard(folder, name, manifest["shards"][name].get("sha256"), schema=None)
     try:
         rows = [_row(row, manifest["configuration"]) for row in table.to_pylist()]
-        return storage.to_table(rows)
+        return storage.to_table(rows), None
     except (KeyError, TypeError, ValueError, ActionError, pa.ArrowException) as reason:
         raise DatasetError(f"shard {folder / name} cannot be upgraded ({reason!r}): {remedy}") from reason
 
