@@ -148,7 +148,7 @@ def test_missing_unknown_or_infinite_context_is_refused(run, batch, context, mes
     predictor = load_predictor(run)
     with pytest.raises(PredictionError, match=message):
         predictor.imagine(view_of(batch, 0), context=context)
-    with pytest.raises(PredictionError, match=f"candidate 0: .*{message}"):
+    with pytest.raises(PredictionError, match=message):
         predictor.imagine_candidates(view_of(batch, 0), [LeverUp((0, 0), (1, 0))], context=context)
 
 
