@@ -21,11 +21,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, Motion, ToolPath
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle, transform_points
 from foretrace.interactions.dataset import Dataset
-from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
 from foretrace.interactions.topdown import TopDownView
@@ -84,7 +83,7 @@ def make_still(folder: Path, number: int, **condition) -> None:
     """One frame, before the blade moves."""
     if not (folder / "truth.json").is_file():
         config = replace(film_config(number), depth_every=1, **condition)
-        short = 1.5 / config.frames_per_second - config.lead_time - config.simulation.path.duration
+        short = 1.5 / config.frames_per_second - config.lead_time - ToolPath().duration
         record_lever_up(*subject(number), folder, replace(config, tail_time=short), seed=number)
 
 
@@ -299,8 +298,9 @@ def judge_simulated(data: Path) -> dict:
     for row in chosen:
         interaction = dataset[row]
         effect = interaction.effect
-        told, _ = judge_motion(interaction.object, effect.pose_trajectory, effect.com_trajectory)
-        agree += told == effect.outcome
+        unseen = Motion(effect.times, effect.pose_trajectory, effect.tool_trajectory, effect.joint_trajectory)
+        judgement = interaction.action.judge(unseen, interaction.object, effect.com_trajectory)
+        agree += judgement.outcome == effect.outcome
         shift = np.linalg.norm(effect.com_trajectory - effect.com_trajectory[0], axis=1)
         k = int((shift > ONSET_SHIFT).argmax())
         onsets.append(np.interp(ONSET_SHIFT, shift[k - 1 : k + 1], effect.times[k - 1 : k + 1]))

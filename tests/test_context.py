@@ -43,7 +43,7 @@ def batch() -> InteractionBatch:
     friction, density = rng.uniform(0.4, 1.2, 40), rng.uniform(300, 1200, 40)
     rest = made.com[:, :1]
     com = rest + (made.com - rest) * (1.3 - friction)[:, None, None]
-    return replace(made, friction=friction, density=density, com=com)
+    return replace(made, com=com, parameters=made.parameters | {"friction": friction, "density": density})
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,9 @@ def test_the_context_is_standardised_by_the_training_part(run, batch):
 
 
 def test_constants_that_never_vary_are_only_shifted(batch):
-    same = replace(batch, friction=np.full(40, 0.8), density=np.full(40, 600.0))
+    same = replace(
+        batch, parameters=batch.parameters | {"friction": np.full(40, 0.8), "density": np.full(40, 600.0)}
+    )
     predictor, _ = fit_predictor(same, CONDITIONED, split_by_seed(40, 0, None), TRAINING)
     assert predictor.known_scale.tolist() == [1.0, 1.0]
     assert np.isfinite(predictor.imagine_batch(same).com).all()

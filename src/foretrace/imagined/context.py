@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import USUAL_STROKE, LeverUp
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -46,17 +46,17 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
 
 def nominal_parameters() -> dict[str, float]:
     """Parameters of the nominal path."""
-    return asdict(USUAL_STROKE)
+    return LeverUp.nominal_parameters()
 
 
-def parameters_of(action: LeverUp) -> dict[str, float]:
+def parameters_of(action: Action) -> dict[str, float]:
     """Parameters of an action's path, by name."""
-    return nominal_parameters()
+    return action.parameters()
 
 
 def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
     """Recorded values of one constant or parameter."""
-    return getattr(batch, name)
+    return batch.parameters.get(name, np.full(len(batch), np.nan))
 
 
 def true_context(
