@@ -29,13 +29,13 @@ from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
-from foretrace.perception import masks
 from foretrace.perception.calibration import Board, calibrate, read_images
 from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_recording
 from foretrace.perception.markers import MarkerLayout, detect_markers
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
+from foretrace.perception.photo import MaskMethod, PhotoConfig, observe_photo
 from foretrace.perception.recordings import open_recording
-from foretrace.perception.views import Observation, PlacedObject, contact_at_pixel, observe, place_object
+from foretrace.perception.views import Observation, PlacedObject
 from foretrace.predictor import load_predictor
 from foretrace.simulation.lens import WEBCAM
 from foretrace.simulation.recording import RecordingConfig, photograph_board, record_lever_up
@@ -183,26 +183,20 @@ def sight_of(
     T_table_camera: np.ndarray,
     camera: PinholeCamera,
     pixel: tuple[float, float],
-    how: str,
+    how: MaskMethod,
     box: tuple[int, int, int, int] | None = None,
 ) -> Observation:
     """What the first frame alone shows of an object of unknown shape."""
     frame = next(open_recording(folder).frames())
-    if how == "depth":
-        assert frame.depth is not None
-        heights = masks.heights_above_table(frame.depth, camera, T_table_camera)
-        mask = masks.find_by_height(heights, pixel)
-        height, rim = masks.object_height(heights, mask), 0.008
-    elif how == "grabcut":
-        assert box is not None
-        mask = masks.pick_object(masks.mask_by_grabcut(frame.image, box), pixel)
-        height, rim = HEIGHT, 0.003
-    else:
-        background = read_image(folder / "background.png")
-        mask = masks.find_by_background(frame.image, background, pixel)
-        height, rim = HEIGHT, 0.003
-    placed = place_object(mask, camera, T_table_camera, height, rim, hull=True)
-    return observe(placed, contact_at_pixel(placed, pixel, camera, T_table_camera))
+    return observe_photo(
+        frame.image,
+        camera,
+        pixel,
+        T_table_camera=T_table_camera,
+        depth=frame.depth if how == "depth" else None,
+        background=read_image(folder / "background.png"),
+        config=PhotoConfig(how, box, None if how == "depth" else HEIGHT, hull=True),
+    )
 
 
 def overlap(a: TopDownView, b: TopDownView) -> float:
