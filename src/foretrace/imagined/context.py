@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import USUAL_STROKE, LeverUp
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -49,17 +49,19 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
 @cache
 def nominal_parameters() -> Mapping[str, float]:
     """Parameters of the nominal path."""
-    return MappingProxyType(asdict(USUAL_STROKE))
+    return MappingProxyType(LeverUp.nominal_parameters())
 
 
-def parameters_of(actions: Sequence[LeverUp]) -> dict[str, Float[np.ndarray, " n"]]:
-    """Parameters of the actions' paths, by name."""
-    return {name: np.full(len(actions), value) for name, value in nominal_parameters().items()}
+def parameters_of(actions: Sequence[Action]) -> dict[str, Float[np.ndarray, " n"]]:
+    """Parameters of the actions' paths, by name; NaN where an action has no such one."""
+    found = [action.parameters() for action in actions]
+    names = dict.fromkeys(name for parameters in found for name in parameters)
+    return {name: np.array([parameters.get(name, np.nan) for parameters in found]) for name in names}
 
 
 def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
     """Recorded values of one constant or parameter."""
-    return getattr(batch, name)
+    return batch.parameters.get(name, np.full(len(batch), np.nan))
 
 
 def true_context(

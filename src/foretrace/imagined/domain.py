@@ -150,7 +150,7 @@ def _look_up(
 ) -> Bool[np.ndarray, " n"]:
     """Whether points [m] lie in the mask."""
     pixels = np.rint(CONTACT_PIXEL - points / METRES_PER_PIXEL).astype(int)
-    there = ((pixels >= 0) & (pixels < mask.shape)).all(axis=1)
+    there = np.all((pixels >= 0) & (pixels < mask.shape), axis=1)
     rows, columns = np.where(there[:, None], pixels, 0).T
     return there & mask[rows, columns]
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, final
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action
 from foretrace.errors import PredictionError
 from foretrace.geometry import Numbers
 from foretrace.imagined.context import (
@@ -69,7 +69,7 @@ class Imaginer(ABC):
     def imagine(
         self,
         view: TopDownView,
-        action: LeverUp | None = None,
+        action: Action | None = None,
         *,
         context: Mapping[str, float] | None = None,
         observed: Effect | ObservedMotion | None = None,
@@ -96,7 +96,7 @@ class Imaginer(ABC):
         check_view(view)
         parameters = {}
         if action is not None:
-            _check_type("action", action, LeverUp)
+            _check_type("action", action, Action)
             parameters = parameters_of([action])
         values = given_context(self.context, context, parameters)
         batch = InteractionBatch.from_views([view])
@@ -151,7 +151,7 @@ class Imaginer(ABC):
     def imagine_candidates(
         self,
         view: TopDownView,
-        actions: Iterable[LeverUp],
+        actions: Iterable[Action],
         *,
         context: Mapping[str, float] | None = None,
         com: Numbers | None = None,
@@ -177,7 +177,7 @@ class Imaginer(ABC):
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")
         for k, action in enumerate(actions):
-            _check_type(f"candidate {k}", action, LeverUp)
+            _check_type(f"candidate {k}", action, Action)
         candidates = Candidates(view, actions)
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
