@@ -1,6 +1,6 @@
 import json
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 
 from factories import fake_batch
-from foretrace.actions import Stroke, ToolPath
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.cli import main
 from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
@@ -42,7 +42,8 @@ def batch() -> InteractionBatch:
     friction, density = rng.uniform(0.4, 1.2, 40), rng.uniform(300, 1200, 40)
     rest = made.com[:, :1]
     com = rest + (made.com - rest) * (1.3 - friction)[:, None, None]
-    return replace(made, friction=friction, density=density, com=com)
+    parameters = made.parameters | {"friction": friction, "density": density}
+    return replace(made, parameters=parameters, com=com)
 
 
 @pytest.fixture(scope="module")
@@ -58,18 +59,20 @@ def test_what_is_known_is_standardised_by_the_training_part(run, batch):
     tensors = load_file(run / "model.safetensors")
     train = json.loads((run / "split.json").read_text())["train"]  # ids are row numbers here
     for k, name in enumerate(NAMES):
-        values = getattr(batch, name)[train]
+        values = batch.parameters[name][train]
         assert tensors["known_mean"][k] == pytest.approx(values.mean())
         assert tensors["known_scale"][k] == pytest.approx(values.std())
     predictor = load_predictor(run)
-    values = np.stack([batch.friction, batch.density], axis=1)[train]
+    values = np.stack([batch.parameters["friction"], batch.parameters["density"]], axis=1)[train]
     inputs = predictor.add_known(torch.zeros(len(values), 0), values)
     torch.testing.assert_close(inputs.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
     torch.testing.assert_close(inputs.std(0, correction=0), torch.ones(2))
 
 
 def test_constants_that_never_vary_are_only_shifted(batch):
-    same = replace(batch, friction=np.full(40, 0.8), density=np.full(40, 600.0))
+    same = replace(
+        batch, parameters=batch.parameters | {"friction": np.full(40, 0.8), "density": np.full(40, 600.0)}
+    )
     predictor, _ = fit_predictor(same, KNOWING, split_by_seed(40, 0, None))
     assert predictor.known_scale.tolist() == [1.0, 1.0]
     assert np.isfinite(predictor.imagine_batch(same).com).all()
@@ -80,7 +83,10 @@ def test_a_saved_predictor_imagines_the_same_alone_and_in_a_batch(run, batch):
     assert predictor.known == NAMES
     whole = predictor.imagine_batch(batch).com
     for k in (0, 17):
-        known = {"friction": float(batch.friction[k]), "density": float(batch.density[k])}
+        known = {
+            "friction": float(batch.parameters["friction"][k]),
+            "density": float(batch.parameters["density"][k]),
+        }
         alone = predictor.imagine(view_of(batch, k), batch.com[k, 0], known)
         np.testing.assert_allclose(alone.com_trajectory, whole[k], atol=1e-6)
     other = predictor.imagine(view_of(batch, 0), batch.com[0, 0], {"friction": 0.1, "density": 600.0})
@@ -106,7 +112,7 @@ def test_an_interrupted_training_goes_on_and_another_one_is_refused(tmp_path, ru
     with pytest.raises(TrainingError, match=r"settings\.known = \['friction', 'density'\], not None"):
         train_predictor(batch, CONFIG, folder, progress=False)
     assert fingerprint(batch, NAMES) != fingerprint(batch)
-    heavier = replace(batch, density=2 * batch.density)
+    heavier = replace(batch, parameters=batch.parameters | {"density": 2 * batch.parameters["density"]})
     assert fingerprint(heavier) == fingerprint(batch)
     with pytest.raises(TrainingError, match=r"training\.data"):
         train_predictor(heavier, KNOWING, folder, progress=False)
@@ -153,7 +159,11 @@ def test_values_for_a_predictor_that_knows_nothing_are_refused(batch):
 
 
 def test_interactions_without_a_record_are_named(run, batch):
-    unknown = replace(batch, density=np.where(batch.ids == 11, np.nan, batch.density))
+    unknown = replace(
+        batch,
+        parameters=batch.parameters
+        | {"density": np.where(batch.ids == 11, np.nan, batch.parameters["density"])},
+    )
     message = (
         "interaction 11 has density = nan: record its density, leave it out, or use a predictor that does not"
     )
@@ -202,11 +212,15 @@ def test_options_of_predict_are_checked(given, knows, simulated, message):
 
 
 def test_the_actions_parameters_are_told_as_constants_are(batch):
-    assert set(PARAMETERS) == set(asdict(Stroke()))
+    assert set(PARAMETERS) == set(LeverUp.nominal_parameters())
     rng = np.random.default_rng(3)
     sweep = rng.uniform(0.4, 1.0, 40)
     rest = batch.com[:, :1]
-    farther = replace(batch, sweep=sweep, com=rest + (batch.com - rest) * sweep[:, None, None])
+    farther = replace(
+        batch,
+        parameters=batch.parameters | {"sweep": sweep},
+        com=rest + (batch.com - rest) * sweep[:, None, None],
+    )
     config = replace(KNOWING, known=("sweep", "speed"), hidden=32, epochs=40)
     split = split_by_seed(40, 0, None)
     predictor, _ = fit_predictor(farther, config, split)
@@ -225,7 +239,8 @@ def test_the_actions_parameters_are_told_as_constants_are(batch):
 def test_predict_is_told_of_the_action_and_compares_with_it(tmp_path, batch, capsys):
     sweep = np.random.default_rng(3).uniform(0.4, 1.0, 40)
     config = replace(KNOWING, known=("sweep",))
-    run = train_predictor(replace(batch, sweep=sweep), config, tmp_path / "run", progress=False)
+    swept = replace(batch, parameters=batch.parameters | {"sweep": sweep})
+    run = train_predictor(swept, config, tmp_path / "run", progress=False)
     polygon = tmp_path / "polygon.txt"
     polygon.write_text("0.1 0\n0.02 0.09\n-0.08 0.05\n-0.07 -0.06\n0.04 -0.09\n")
     command = ["predict", str(run), "--polygon", str(polygon), "--edge", "1", "--compare", "--no-animation"]
@@ -248,6 +263,6 @@ def test_predict_is_told_of_the_action_and_compares_with_it(tmp_path, batch, cap
 
 def test_true_values_are_those_of_physics_and_stroke():
     names = ("sweep", "friction", "insertion")
-    found = true_values(Physics(friction=0.6), names, Stroke(insertion=0.03))
+    found = true_values(Physics(friction=0.6), names, ToolPath(insertion=0.03).parameters())
     assert found == {"sweep": ToolPath.sweep, "friction": 0.6, "insertion": 0.03}
     assert list(found) == list(names)

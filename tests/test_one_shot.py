@@ -360,9 +360,11 @@ def test_outcomes_that_are_not_learned_are_refused(batch):
 
 
 def test_what_is_known_changes_what_is_said(batch):
-    told = replace(batch, friction=np.linspace(0.3, 0.9, len(batch)))
+    told = replace(batch, parameters=batch.parameters | {"friction": np.linspace(0.3, 0.9, len(batch))})
     predictor, _ = fit_predictor(told, replace(QUICK, known=("friction",), epochs=20), everything(told))
-    other = predictor.imagine_batch(replace(told, friction=told.friction[::-1]))
+    other = predictor.imagine_batch(
+        replace(told, parameters=told.parameters | {"friction": told.parameters["friction"][::-1]})
+    )
     assert not np.allclose(other.com, predictor.imagine_batch(told).com, atol=1e-7)
 
 

@@ -48,9 +48,9 @@ def observed_values(batch: InteractionBatch, names: Sequence[str]) -> Float[np.n
     Raises:
         PredictionError: One of them lacks a value.
     """
-    values = (
-        np.array([batch.parameters[name] for name in names], dtype=float).reshape(len(names), len(batch)).T
-    )
+    unknown = np.full(len(batch), np.nan)
+    columns = [batch.parameters.get(name, unknown) for name in names]
+    values = np.array(columns, dtype=float).reshape(len(names), len(batch)).T
     rows, columns = np.nonzero(~np.isfinite(values))
     if len(rows):
         name = names[columns[0]]

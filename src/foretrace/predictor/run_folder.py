@@ -196,7 +196,7 @@ def fingerprint(batch: InteractionBatch, known: Sequence[str] = ()) -> str:
     digest.update(np.ascontiguousarray(batch.support_points).tobytes())
     digest.update("\n".join(batch.outcome.tolist()).encode())
     for name in known:
-        digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
+        digest.update(np.ascontiguousarray(batch.parameters[name]).tobytes())
     return digest.hexdigest()[:16]
 
 
