@@ -37,7 +37,7 @@ def evaluate_recorded(predictor: EffectPredictor, dataset: Dataset) -> Transfer:
         raise DatasetError(f"{dataset.path} has no interaction: import a recording")
     repetitions: Counter[tuple[str, int]] = Counter()
     rows, examples = [], []
-    for interaction, number in zip(dataset, dataset.table["object_id"].to_pylist(), strict=True):
+    for interaction, number in zip(dataset, dataset.index["object_id"].to_pylist(), strict=True):
         if interaction.provenance.source != "recorded":
             raise DatasetError(
                 f"interaction {interaction.id} of {dataset.path} is {interaction.provenance.source}: give a data set "

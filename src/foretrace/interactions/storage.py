@@ -235,7 +235,11 @@ def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
 
 
 def read_shard(
-    folder: Path, name: str, sha256: str | None = None, schema: pa.Schema | None = SCHEMA
+    folder: Path,
+    name: str,
+    sha256: str | None = None,
+    schema: pa.Schema | None = SCHEMA,
+    columns: Sequence[str] | None = None,
 ) -> tuple[pa.Table, bytes]:
     """A shard as a table, and its bytes.
 
@@ -244,6 +248,7 @@ def read_shard(
         name: The shard's name in the manifest.
         sha256: The checksum that it must have, or None to accept any.
         schema: The schema that it must have, or None to accept any.
+        columns: Columns to read; all by default.
 
     Raises:
         DatasetError: The file is missing, damaged, or of another schema.
@@ -258,12 +263,14 @@ def read_shard(
         raise DatasetError(f"shard {path} is corrupt: its checksum is not the manifest's; {remedy}")
     try:
         # In this thread: another may let go of Python's bytes later than the interpreter can bear, when it ends.
-        table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
+        file = pq.ParquetFile(pa.BufferReader(content))
+        found_schema = file.schema_arrow
+        table = file.read(columns=None if columns is None else list(columns), use_threads=False)
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error
-    if schema is not None and not table.schema.equals(schema):
-        found, wanted = ({field.name: field.type for field in each} for each in (table.schema, schema))
+    if schema is not None and not found_schema.equals(schema):
+        found, wanted = ({field.name: field.type for field in each} for each in (found_schema, schema))
         odd = ", ".join(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
         raise DatasetError(f"shard {path} has another schema (differs in {odd}); {remedy}")
     return table, content
