@@ -152,7 +152,7 @@ class TopDownView:
         height = np.where(count.reshape(VIEW_SIZE, VIEW_SIZE) == 0, closed, height)
         return cls(height > 0, height)
 
-    def seen_from(self, action: LeverUp) -> "TopDownView":
+    def seen_from(self, action: Action) -> "TopDownView":
         """The object as seen in the frame of another action; parts beyond this view stay unseen.
 
         Args:
