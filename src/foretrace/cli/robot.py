@@ -63,8 +63,8 @@ def robot(
         raise RobotError("--execute needs --host, the controller's address")
     watch, limits, kinematics = WatchConfig(timeout, deviation), ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
-    action, tool_path = LeverUp(contact, direction), ToolPath(clearance=clearance)
-    legs = plan_lever_up(kinematics, action, T_table_base, tool_path, speed)
+    action = LeverUp(contact, direction, ToolPath(clearance=clearance))
+    legs = plan_lever_up(kinematics, action, T_table_base, speed)
     legs += plan_retreat(legs) if retreat else []
     postures = [kinematics.along(leg.joints) for leg in legs]
     checks = [
