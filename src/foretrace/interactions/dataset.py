@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import ACTIONS, FAILED, action_transform
@@ -81,8 +82,9 @@ class InteractionBatch:
         parameters = {name: values[rows] for name, values in self.parameters.items()}
         return replace(self, **kept, parameters=parameters)
 
-    def batches(self, size: int) -> Iterator["InteractionBatch"]:
-        """The same in parts of a number of rows, in order."""
+    def batches(self, size: int | None = None) -> Iterator["InteractionBatch"]:
+        """The same in parts of a number of rows, in order; by default in one."""
+        size = size or max(1, len(self))
         return (self[start : start + size] for start in range(0, len(self), size))
 
     @classmethod
@@ -261,6 +263,22 @@ class Dataset:
         for start in range(0, len(self), size):
             yield self._batch(self._rows(slice(start, start + size)), self.times)
 
+    @property
+    def ids(self) -> Int[np.ndarray, " batch"]:
+        """Number of each interaction within its data set."""
+        return self.index["id"].to_numpy()
+
+    @cached_property
+    def lengths(self) -> Int[np.ndarray, " batch"]:
+        """Number of samples of each trajectory."""
+        parts = [
+            pc.list_value_length(  # pyright: ignore[reportAttributeAccessIssue]
+                self._rows(slice(start, start + ROWS_AT_ONCE), ["times"])["times"]
+            ).to_numpy()
+            for start in range(0, len(self), ROWS_AT_ONCE)
+        ]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *parts]).astype(np.int64)
+
     @cached_property
     def times(self) -> Float[np.ndarray, " time"]:
         """Sample times [s] of the longest interaction, with which all others agree.
@@ -321,6 +339,8 @@ class Dataset:
         index = self.index.take(pa.array(rows, type=pa.int64()))
         view = Dataset(self._shards, index, self._places[rows], self.manifest)
         view._objects = self._objects
+        if "times" in self.__dict__:  # common to all that come from the same data set
+            view.__dict__["times"] = self.times
         return view
 
     def _rows(self, chosen: slice, columns: list[str] | None = None) -> pa.Table:
