@@ -212,8 +212,8 @@ def fingerprint(batch: InteractionBatch, context: Sequence[str] = ()) -> str:
     """A short hash of everything in a batch that a training can read, and of the context that it is conditioned on."""
     names = ("ids", "mask", "height", "times", "com", "pose", "length", "slip_index", "support_points")
     arrays = [np.ascontiguousarray(getattr(batch, name)).tobytes() for name in names]
-    told = [np.ascontiguousarray(column_of(batch, name)).tobytes() for name in context]
-    return short_hash(*arrays, "\n".join(batch.outcome.tolist()).encode(), *told)
+    columns = [np.ascontiguousarray(column_of(batch, name)).tobytes() for name in context]
+    return short_hash(*arrays, "\n".join(batch.outcome.tolist()).encode(), *columns)
 
 
 def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
