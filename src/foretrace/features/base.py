@@ -176,7 +176,7 @@ def make_features(label: str, **options: Option) -> FeatureExtractor:
 
 
 class NoFeatures(FeatureExtractor):
-    """The paper's baseline: the predictor is told nothing of the object but where it lies (section 5.2)."""
+    """The paper's baseline: the predictor is given nothing of the object but where it lies (section 5.2)."""
 
     label = "none"
 

@@ -93,7 +93,7 @@ class EffectPredictor(Imaginer, nn.Module):
         self.config = config
         """Its settings."""
         self.features = config.make_features()
-        """What it is told about the object."""
+        """Features of the object that it is given."""
         self.outcomes = tuple(outcomes)
         """Outcomes that it distinguishes."""
         self.state: StateKind = state

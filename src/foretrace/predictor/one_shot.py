@@ -58,7 +58,7 @@ class OneShotConfig(PredictorConfig):
     training = TrainConfig(epochs=150, learning_rate=4e-3)
 
     features: str = "outline"
-    """Features of the object: it reads outline alone."""
+    """Features of the object that the predictor is given: outline alone fits."""
     hidden: int = 128
     """Units of each hidden layer."""
     layers: int = 3

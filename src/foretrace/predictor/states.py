@@ -52,7 +52,7 @@ def state_size(kind: StateKind) -> int:
 
 
 def valid_lengths(batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
-    """Samples of each trajectory that are learned and judged: up to where the object slipped."""
+    """Samples of each trajectory that are learned and evaluated: up to where the object slipped."""
     return np.minimum(batch.length, batch.slip_index)
 
 
