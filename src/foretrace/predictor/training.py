@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from foretrace.errors import TrainingError
-from foretrace.features.base import FeatureExtractor, FitPart, fast_precision
+from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
 from foretrace.files import short_hash
 from foretrace.imagined.context import recorded_context
@@ -50,7 +50,7 @@ class _Part:
     source: Source
     """Its interactions."""
     inputs: Tensor
-    """Inputs of the features; of a large part the features themselves, where they never change."""
+    """Inputs of the features; in a large part the features may take their place."""
     context: np.ndarray
     """(batch, context) values that the predictor is conditioned on [SI]."""
     states: np.ndarray
@@ -259,13 +259,8 @@ class _Training:
 
     def _fit_features(self, report: Callable[[str], None]) -> None:
         features, device, seed = self.predictor.features, self.predictor.device, self.config.seed
-        if not features.learns:
-            return
-        train, validation = (
-            FitPart(p.inputs.to(device), p.source.batch() if isinstance(p.source, Dataset) else p.source)
-            for p in (self.train, self.validation)
-        )
-        if self.fitted is None:
+        train, validation = (FitPart(p.inputs.to(device), p.source) for p in (self.train, self.validation))
+        if self.fitted is None or not features.learns:
             features.fit(train, validation, seed=seed, report=report)
             return
         options = json.dumps([features.label, features.options, features.precision, seed])
@@ -304,9 +299,10 @@ class _Training:
         return features
 
     def _features_of(self, part: _Part) -> Tensor:
-        computed = part.large and _never_change(self.predictor.features)
-        features = part.inputs if computed else self.predictor.compute_features(part.inputs)
-        return self.predictor.add_context(features.to(self.predictor.device), part.context)
+        features = self.predictor.compute_features(
+            part.inputs, in_place=part.large and not self.predictor.features.trainable
+        )
+        return self.predictor.add_context(features, part.context)
 
     def _epoch(self, epoch: int, fixed: Tensor | None) -> float:
         """One pass over the training part; the mean loss. ``fixed`` are features that do not change."""
@@ -396,10 +392,6 @@ def _hash_split(split: Split) -> str:
     return short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()])
 
 
-def _never_change(features: FeatureExtractor) -> bool:
-    return not (features.trainable or features.learns)
-
-
 def _prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
     if isinstance(source, Dataset):
         return _prepare_in_pieces(source, predictor)
@@ -421,11 +413,8 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> _Part:
     done = 0
     for batch in source.batches():
         piece = _prepare(batch, predictor)
-        inputs = (
-            predictor.compute_features(piece.inputs) if _never_change(predictor.features) else piece.inputs
-        )
         columns = {
-            "inputs": inputs.cpu().numpy(),
+            "inputs": piece.inputs.numpy(),
             "context": piece.context,
             "states": piece.states.astype(np.float32),
             "lengths": piece.lengths,
