@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foretrace import cli
-from foretrace.actions import LeverUp, Screwdriver, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath, tool_transforms
 from foretrace.errors import RobotError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.record import Physics
@@ -20,7 +20,6 @@ from foretrace.robot.execution import WatchConfig, refuse_unready
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, plan_retreat, read_base_pose
 from foretrace.simulation import arm
-from foretrace.simulation.engine import tip_transforms
 from foretrace.simulation.scene import build_scene
 from ur_controller import RunningController
 
@@ -66,7 +65,7 @@ def test_the_blade_follows_the_tool_path_on_the_table(legs):
     """With another library's forward kinematics, on a base that is turned, shifted and raised."""
     ur = pytest.importorskip("ur_analytic_ik")
     times = np.minimum(0.5 * legs[1].times, ToolPath().duration)
-    wanted = np.linalg.inv(ACTION.T_action_object) @ tip_transforms(ToolPath(), times)
+    wanted = np.linalg.inv(ACTION.T_action_object) @ tool_transforms(ACTION.tool_motion(times))
     flanges = np.array([ur.ur10.forward_kinematics(*q) for q in legs[1].joints])
     tips = T_TABLE_BASE @ flanges @ arm.T_flange_tip(Screwdriver())
     np.testing.assert_allclose(tips, wanted, atol=2e-5)
