@@ -19,9 +19,9 @@ import torch
 
 import foretrace
 from foretrace.errors import DatasetError, ResultsError
-from foretrace.files import sole_writer
+from foretrace.files import flatten, sole_writer
 from foretrace.files import write_bytes as write_atomically
-from foretrace.predictor.run_folder import flatten, git_commit
+from foretrace.predictor.run_folder import git_commit
 
 FORMAT = "foretrace-results"
 FORMAT_VERSION = 1
