@@ -22,6 +22,9 @@ from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
 
+ROWS_AT_ONCE = 16
+"""Rows of a table that are unpacked together while iterating."""
+
 
 @dataclass(frozen=True)
 class InteractionBatch:
@@ -164,12 +167,21 @@ class Dataset:
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):
                 raise IndexError(f"interaction {rows} of {len(self)}")
-            row = self.table.slice(rows % len(self), 1).to_pylist()[0]
-            return storage.decode(row, self._object(row["object"]))
+            return next(self._interactions(self.table.slice(rows % len(self), 1)))
         return self._view(np.arange(len(self))[rows])
 
     def __iter__(self) -> Iterator[Interaction]:
-        return (self[k] for k in range(len(self)))
+        return self._interactions(self.table)
+
+    def __repr__(self) -> str:
+        outcomes = ", ".join(f"{count} {outcome}" for outcome, count in self.outcomes().items())
+        return f"Dataset({str(self.path)!r}: {len(self)} interactions{f': {outcomes}' if outcomes else ''})"
+
+    def _interactions(self, table: pa.Table) -> Iterator[Interaction]:
+        """The interactions in a table's rows, of which few are unpacked at once."""
+        for part in table.to_batches(max_chunksize=ROWS_AT_ONCE):
+            for row in part.to_pylist():
+                yield storage.decode(row, self._object(row["object"]))
 
     def where(self, **conditions: Any) -> "Dataset":
         """The interactions that meet every condition.
