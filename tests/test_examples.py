@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from engines_at_hand import WITHOUT_BULLET
 from export_samples import fake_data
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
@@ -126,3 +127,11 @@ def test_render_scene(tmp_path: Path) -> None:
     printed = run_python(EXAMPLES / "render_scene.py", tmp_path / "scene.png")
     assert "levered, at 4 moments" in printed
     assert np.ptp(np.asarray(Image.open(tmp_path / "scene.png"))) > 100
+
+
+@WITHOUT_BULLET
+def test_own_action(tmp_path: Path) -> None:
+    printed = run_python(EXAMPLES / "own_action.py", tmp_path / "pushes")
+    moved = re.findall(r"pushed, ([\d.]+) cm in MuJoCo, ([\d.]+) in Bullet; same again: True", printed)
+    assert len(moved) == 3
+    assert all(abs(float(mujoco) - float(bullet)) < 1 for mujoco, bullet in moved)

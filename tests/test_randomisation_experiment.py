@@ -33,9 +33,10 @@ from foretrace.experiments.randomisation_report import (
     randomisation_figure,
     summarise,
 )
-from foretrace.experiments.transfer_objects import PENTAGON, Subject
+from foretrace.experiments.transfer_objects import Subject
 from foretrace.imagined import ImaginedBatch
 from foretrace.interactions.record import Outcome, Physics
+from foretrace.objects.everyday import PENTAGON
 from foretrace.predictor import TrainConfig
 from foretrace.predictor.base import EffectPredictor
 from foretrace.simulation.collect import CollectConfig, collect, trial

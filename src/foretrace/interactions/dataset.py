@@ -186,8 +186,8 @@ class Dataset:
         return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{count} {outcome}" for outcome, count in self.outcomes().items())
-        return f"<Dataset {str(self.path)!r}: {len(self)} interactions{counts and f' ({counts})'}>"
+        outcomes = ", ".join(f"{count} {outcome}" for outcome, count in self.outcomes().items())
+        return f"Dataset({str(self.path)!r}: {len(self)} interactions{f': {outcomes}' if outcomes else ''})"
 
     def __len__(self) -> int:
         return len(self._places)

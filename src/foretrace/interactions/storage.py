@@ -90,6 +90,8 @@ ACTION_COLUMNS = ("action", "contact", "direction", "path", "tool")
 PROVENANCE_COLUMNS = tuple(field.name for field in fields(Provenance) if field.name != "versions")
 EXECUTION = "execution_"
 """Beginning of the columns of an `ExecutionOffset`."""
+_HEIGHTS = (np.arange(65536) * HEIGHT_STEP).astype(np.float32)
+"""Height of each number of steps [m]; 200 steps are 0.02 exactly."""
 SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
 TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
 """Numbers per sample of each trajectory column; the joints' count is a column of its own."""
@@ -205,8 +207,7 @@ def unpack_masks(packed: Sequence[bytes]) -> np.ndarray:
 def unpack_heights(packed: Sequence[bytes]) -> np.ndarray:
     """(n, 128, 128) float32 height maps [m] from their stored form."""
     steps = np.frombuffer(b"".join(packed), dtype="<u2")
-    lookup = (np.arange(65536) * HEIGHT_STEP).astype(np.float32)  # 200 steps are 0.02 exactly
-    return lookup[steps].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
+    return _HEIGHTS[steps].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
 
 
 def to_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
