@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from foretrace.evaluation.results import Metrics
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.imagined import ImaginedBatch
 from foretrace.interactions.dataset import InteractionBatch
@@ -113,7 +112,7 @@ def _summary(errors: np.ndarray) -> dict[str, float | int]:
 
 def measure_errors(
     predictor: EffectPredictor, batch: InteractionBatch, inputs: Shaped[Tensor, "batch ..."]
-) -> Metrics:
+) -> dict[str, float]:
     """Errors of trajectories imagined from the observed first sample (paper, section 5.2), in cm.
 
     Args:

@@ -1,8 +1,8 @@
 """How a sentence about results is tested on a table of them.
 
 A `Claim` is one sentence with the `Check`s that test it. A check takes one number from every seed, such as the error
-of one predictor less the error of another one in the same seed, and asks where the 95 % bootstrap interval of its
-mean over the seeds lies:
+of one predictor less the error of another one in the same seed, and asks where the 95 % interval of its mean over the
+seeds lies (`foretrace.evaluation.statistics.interval`):
 
 - supported: wholly where the claim needs it,
 - contradicted: wholly outside,
@@ -20,10 +20,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from foretrace.evaluation.statistics import mean_interval
+from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
+from foretrace.evaluation.tables import markdown_table
 
 MIN_SEEDS = 3
-"""With fewer seeds nothing is decided. With few, a bootstrap's interval is narrower than it should be."""
+"""With fewer seeds nothing is decided."""
 KEY = ["experiment", "features", "setting", "metric"]
 
 Unit = Literal["cm", "%", "times"]
@@ -37,6 +38,14 @@ class Cell(NamedTuple):
     features: str
     setting: str
     metric: str
+
+
+Ratio = Callable[[Cell], float]
+"""Size of the test part divided by that of the training part, by the place of the table."""
+
+
+def _usual_ratio(cell: Cell) -> float:
+    return TEST_TO_TRAIN
 
 
 @dataclass(frozen=True)
@@ -61,16 +70,16 @@ class Check:
         """Whether the claim hangs on it; if not, it is there for its number."""
         return self.above is not None or self.below is not None
 
-    def judge(self, values: dict[Cell, pd.Series]) -> dict[str, Any]:
-        """Number, interval, seeds, and whether that supports the claim."""
+    def evaluate(self, values: dict[Cell, pd.Series], ratio: Ratio) -> dict[str, Any]:
+        """Number, interval, seeds, and whether that supports the claim; of the cells' ratios the largest counts."""
         found = [values[cell].rename(str(k)) for k, cell in enumerate(self.cells) if cell in values]
         common = pd.concat(found, axis=1, join="inner") if len(found) == len(self.cells) else pd.DataFrame()
         row: dict[str, Any] = {"comparison": self.label, "needed": self.needed, "unit": self.unit}
         if len(common) < MIN_SEEDS:
             return {**row, "mean": None, "low": None, "high": None, "seeds": len(common), "result": "missing"}
-        mean, low, high = mean_interval(self.contrast(common.to_numpy(float)))
-        numbers = {"mean": round(mean, 6), "low": round(low, 6), "high": round(high, 6)}
-        return {**row, **numbers, "seeds": len(common), "result": self._support(low, high)}
+        found = interval(self.contrast(common.to_numpy(float)), max(ratio(cell) for cell in self.cells))
+        result = self._support(found.low, found.high)
+        return {**row, **found.as_dict(6), "seeds": found.seeds, "result": result}
 
     @property
     def needed(self) -> str:
@@ -97,9 +106,9 @@ class Claim:
     """How it is tested."""
     checks: tuple[Check, ...]
 
-    def judge(self, values: dict[Cell, pd.Series]) -> dict[str, Any]:
+    def evaluate(self, values: dict[Cell, pd.Series], ratio: Ratio = _usual_ratio) -> dict[str, Any]:
         """Whether it holds, and the numbers."""
-        rows = [check.judge(values) for check in self.checks]
+        rows = [check.evaluate(values, ratio) for check in self.checks]
         results = [row["result"] for row, check in zip(rows, self.checks, strict=True) if check.decides]
         holds: bool | str = "undecided"
         if "contradicted" in results:
@@ -132,12 +141,51 @@ def by_cell(table: pd.DataFrame) -> dict[Cell, pd.Series]:
     return {cell: pd.Series(values).sort_index() for cell, values in cells.items()}
 
 
-def summarise(table: pd.DataFrame) -> pd.DataFrame:
-    """One row per cell: mean over the seeds, standard deviation, 95 % bootstrap interval, number of seeds."""
-    rows = []
-    for cell, values in by_cell(table).items():
-        numbers = values.to_numpy(float)
-        mean, low, high = mean_interval(numbers) if len(numbers) > 1 else (numbers[0], np.nan, np.nan)
-        deviation = numbers.std(ddof=1) if len(numbers) > 1 else np.nan
-        rows.append((*cell, mean, deviation, low, high, len(numbers)))
-    return pd.DataFrame(rows, columns=[*KEY, "mean", "std", "low", "high", "seeds"])
+def cell_table(table: pd.DataFrame, ratio: Ratio = _usual_ratio) -> pd.DataFrame:
+    """One row per cell: mean over the seeds, its 95 % interval, standard deviation, number of seeds."""
+    rows = [
+        (*cell, *interval(values, ratio(cell)), values.std(ddof=1) if len(values) > 1 else np.nan)
+        for cell, values in by_cell(table).items()
+    ]
+    return pd.DataFrame(rows, columns=[*KEY, "mean", "low", "high", "seeds", "std"])
+
+
+def tally(row: dict[str, Any]) -> str:
+    """An evaluated claim's numbers in a line: a single deciding check in full; of several, how many are supported."""
+    deciding = [number for number in row["numbers"] if number["needed"]]
+    if len(deciding) == 1:
+        return f"{deciding[0]['comparison']}: {_in_words(deciding[0])}"
+    kinds: dict[str, list[str]] = {}
+    for number in deciding:
+        kinds.setdefault(number["result"], []).append(number["comparison"])
+    parts = [
+        f"{len(names)} {kind}" + (f" ({', '.join(names)})" if kind in ("contradicted", "open") else "")
+        for kind, names in kinds.items()
+    ]
+    return f"of {len(deciding)} comparisons " + ", ".join(parts)
+
+
+def _in_words(number: dict[str, Any]) -> str:
+    if number["mean"] is None:
+        return "rows missing"
+    mean, low, high = (in_unit(number[name], number["unit"]) for name in ("mean", "low", "high"))
+    return f"{mean} [{low}, {high}], {number['seeds']} seeds"
+
+
+def holds_in_words(row: dict[str, Any]) -> str:
+    """``yes``, ``no`` or ``undecided``."""
+    return row["holds"] if isinstance(row["holds"], str) else "yes" if row["holds"] else "no"
+
+
+def claims_markdown(rows: list[dict[str, Any]]) -> list[str]:
+    """A table of the claims, and one of all their comparisons."""
+    verdicts = [[r["section"], r["claim"], holds_in_words(r), r["test"], tally(r)] for r in rows]
+    comparisons = [
+        [row["name"], number["comparison"], _in_words(number), number["needed"],
+         number["result"] if number["needed"] else "does not decide"]
+        for row in rows for number in row["numbers"]
+    ]  # fmt: skip
+    return [
+        markdown_table(["Section", "Claim", "Holds here", "Tested by", "Result"], verdicts),
+        markdown_table(["Claim", "Comparison", "Mean [95 % interval]", "Needed", "Result"], comparisons),
+    ]

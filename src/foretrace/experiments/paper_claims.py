@@ -1,18 +1,16 @@
 """What the paper says of its results, each sentence tested on a table of ours.
 
 The paper gives most of its results as pictures, so what can be compared are orderings, and the few numbers of
-its text. How a comparison is judged, and what it takes for a claim to hold: `foretrace.evaluation.judging`.
+its text. How a comparison is tested, and what it takes for a claim to hold: `foretrace.evaluation.claims`.
 """
 
-import json
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from foretrace.evaluation.judging import Cell, Check, Claim, by_cell, in_unit, summarise
+from foretrace.evaluation.claims import Cell, Check, Claim
+from foretrace.experiments.paper_comparisons import CORNERS as PAIRS
+from foretrace.experiments.paper_comparisons import SIZES
 
 SHAPE_CONTEXTS = ("sc-200", "sc-800", "sc-3200")
 AUTOENCODERS = ("ae-256", "ae-512")
@@ -22,10 +20,6 @@ GENERIC = UNSUPERVISED + SUPERVISED
 TASK_SPECIFIC = ("sp-pred", "sp-truth")
 PAPER_FEATURES = ("none", *GENERIC, *TASK_SPECIFIC)
 """The paper's ten predictors, in the order of its figures."""
-PAIRS = ("3&4", "5&6", "7&8", "9&10")
-"""Corner counts held out together (paper, figures 9b and 13)."""
-SIZES = ("2", "4", "8", "16", "32", "64")
-"""Training sizes of figure 11 [% of the data]."""
 TOLERANCE = 0.02
 """How far an accuracy may lie below one that the paper calls reached or about so."""
 GRACEFUL = 2.0
@@ -170,7 +164,7 @@ FEATURE_CLAIMS = (
     Claim(
         "supervised-steadier", "5.2", "Models using unsupervised features have higher variance on error.",
         "The mean distance of an error from its median over the seeds is larger with unsupervised features than "
-        "with supervised ones (Brown and Forsythe's comparison); standard deviations are in summary.csv.",
+        "with supervised ones (Brown and Forsythe's comparison); standard deviations are in summary.json.",
         (Check("deviation, unsupervised minus supervised", _shuffled(*SUPERVISED, *UNSUPERVISED),
                _deviations_apart(2), above=0.0),),
     ),
@@ -300,61 +294,3 @@ NOVEL_CLAIMS = (
 CLAIMS = SUPPORT_POINT_CLAIMS + FEATURE_CLAIMS + SIZE_CLAIMS + NOVEL_CLAIMS
 """Every claim of the paper's sections 5.1 to 5.3 that a table can be asked about."""
 
-
-def judge_claims(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Every claim of the paper, tested on a table: name, section, claim, test, holds, numbers."""
-    values = by_cell(table)
-    return [claim.judge(values) for claim in CLAIMS]
-
-
-def tally(row: dict[str, Any]) -> str:
-    """A judged claim's numbers in a line: a single deciding check in full; of several, how many are supported."""
-    deciding = [number for number in row["numbers"] if number["needed"]]
-    if len(deciding) == 1:
-        return f"{deciding[0]['comparison']}: {_interval(deciding[0])}"
-    kinds: dict[str, list[str]] = {}
-    for number in deciding:
-        kinds.setdefault(number["result"], []).append(number["comparison"])
-    parts = [
-        f"{len(names)} {kind}" + (f" ({', '.join(names)})" if kind in ("contradicted", "open") else "")
-        for kind, names in kinds.items()
-    ]
-    return f"of {len(deciding)} comparisons " + ", ".join(parts)
-
-
-def _interval(number: dict[str, Any]) -> str:
-    if number["mean"] is None:
-        return "rows missing"
-    mean, low, high = (in_unit(number[name], number["unit"]) for name in ("mean", "low", "high"))
-    return f"{mean} [{low}, {high}], {number['seeds']} seeds"
-
-
-def holds_in_words(row: dict[str, Any]) -> str:
-    """``yes``, ``no`` or ``undecided``."""
-    return row["holds"] if isinstance(row["holds"], str) else "yes" if row["holds"] else "no"
-
-
-def write_claims(table: pd.DataFrame, out: Path) -> list[Path]:
-    """Judge the claims and write ``claims.json``, ``claims.md`` and ``summary.csv``; returns their paths."""
-    out.mkdir(parents=True, exist_ok=True)
-    rows = judge_claims(table)
-    paths = [out / name for name in ("claims.json", "claims.md", "summary.csv")]
-    paths[0].write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    paths[1].write_text(_markdown(rows), encoding="utf-8")
-    summarise(table).to_csv(paths[2], index=False, float_format="%.6g")
-    return paths
-
-
-def _markdown(rows: list[dict[str, Any]]) -> str:
-    """A table of the claims, and below it one of all their comparisons."""
-    lines = ["| Section | Claim | Holds here | Tested by | Result |", "| --- | --- | --- | --- | --- |"]
-    for row in rows:
-        cells = (row["section"], row["claim"], holds_in_words(row), row["test"], tally(row))
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", "| Claim | Comparison | Mean [95 % interval] | Needed | Result |", "| --- " * 5 + "|"]
-    for row in rows:
-        for number in row["numbers"]:
-            result = number["result"] if number["needed"] else "does not decide"
-            cells = (row["name"], number["comparison"], _interval(number), number["needed"], result)
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
