@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foretrace.cli.evaluation import print_errors
 from foretrace.cli.outlines import read_mask
 
 if TYPE_CHECKING:
@@ -35,11 +34,15 @@ def demo(
     """
     from dataclasses import replace
 
-    from foretrace.evaluation.metrics import evaluate_predictor
+    from rich.console import Console
+
+    from foretrace.evaluation.run import run_experiment
+    from foretrace.experiments.predictor import Predictor
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import scene_animation
-    from foretrace.pictures.scene import comparison_figure, contact_sheet
-    from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
+    from foretrace.pictures.contact_sheet import contact_sheet
+    from foretrace.pictures.scene import comparison_figure
+    from foretrace.predictor import TrainConfig, load_predictor, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
@@ -56,7 +59,7 @@ def demo(
         print(f"2. Training the LSTM with {name}")
         run = train_predictor(dataset, replace(config, features=label), out / "runs" / label)
         predictors[name] = load_predictor(run)
-        print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
+        print(run_experiment(Predictor(run, out / "data"), console=Console(quiet=True)).report)
 
     print("3. Predicting shapes and an object that were not in the data, and simulating them")
     shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}

@@ -186,7 +186,7 @@ def predict(
     from dataclasses import replace
 
     from foretrace.actions import Stroke
-    from foretrace.cli.futures import outlook_of, radius_of, say_futures
+    from foretrace.cli.futures import prediction_band, radius_of, say_futures
     from foretrace.interactions.record import Physics
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import Scene, scene_figure
@@ -235,7 +235,7 @@ def predict(
         scene = replace(Scene.observed(truth, paths), title=title)
     else:
         scene = Scene.imagined(obj, action, imagined.times, paths)
-    scene = replace(scene, outlook=outlook_of(imagined))
+    scene = replace(scene, band=prediction_band(imagined))
     say_futures(imagined)
     out.mkdir(parents=True, exist_ok=True)
     _write_trajectory(out, run, obj, action, imagined, truth)

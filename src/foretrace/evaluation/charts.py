@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
-from foretrace.pictures.scene import GREY, INK
+from foretrace.pictures.style import GREY, INK
 
 
 class Style(NamedTuple):
@@ -70,7 +70,9 @@ def style_of(name: str) -> Style:
         return STYLES[name]
     number = zlib.crc32(name.encode())
     palette, lines = (PURPLE, GREEN, ORANGE, SKY, BLUE, VERMILLION), (DASHED, SOLID, DOTTED)
-    return Style(palette[number % len(palette)], MARKERS[number // 7 % len(MARKERS)], lines[number // 11 % len(lines)])
+    return Style(
+        palette[number % len(palette)], MARKERS[number // 7 % len(MARKERS)], lines[number // 11 % len(lines)]
+    )
 
 
 def family_of(name: str) -> str:
@@ -174,7 +176,9 @@ def grid(ax: Axes, **settings: Any) -> None:
 def legend(fig: Figure, names: Iterable[str], extra: Sequence[Line2D] = (), *, lines: bool = True) -> None:
     """All that is drawn, below the axes."""
     handles = [
-        Line2D([], [], linestyle=style_of(name).line if lines else "none", label=name, **marks(style_of(name)))
+        Line2D(
+            [], [], linestyle=style_of(name).line if lines else "none", label=name, **marks(style_of(name))
+        )
         for name in names
     ]
     fig.legend(handles=[*handles, *extra], loc="outside lower center", ncols=12, columnspacing=1.2)

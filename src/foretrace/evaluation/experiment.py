@@ -26,6 +26,19 @@ Row = Mapping[str, Plain]
 
 EXPERIMENTS: Registry[type["Experiment"]] = Registry("experiment", "foretrace.experiments", ResultsError)
 """Every experiment by its label."""
+SUMMARIES = {
+    "predictor": "Errors of one trained predictor, over the full trajectory and at its end.",
+    "paper": "The paper's comparisons of features, training sizes, steps ahead and novel shapes.",
+    "randomisation": "What randomised training data do for transfer, and what it helps to know what was drawn.",
+    "reconstruction": "What the codes of autoencoders retain of masks.",
+    "replay": "How far simulated motions of rigid bodies stray from recorded ones.",
+    "transfer": "Predictions against recorded lever-ups, or against a stand-in for the real robot.",
+    "non-flat": "Masks against height maps of objects that are not flat.",
+    "uncertainty": "How far to trust probabilities, regions and samples of a predictor of several futures.",
+}
+"""Experiments that come with foretrace, each in a line; their modules are imported when they are looked up."""
+for _label in SUMMARIES:
+    EXPERIMENTS.declare(_label, f"foretrace.experiments.{_label.replace('-', '_')}")
 
 
 @dataclass(frozen=True)
@@ -144,7 +157,6 @@ class Experiment(ABC):
     def judge(self, rows: "pd.DataFrame") -> list[dict[str, Any]]:
         """Which sentences hold, JSON-able; as from `foretrace.evaluation.claims.Claim.evaluate`."""
         return []
-
 
 
 def kept_folder(folder: Path, name: str) -> Path:

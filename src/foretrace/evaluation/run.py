@@ -62,6 +62,7 @@ def run_experiment(
     workers: int | None = None,
     threads: int = 1,
     console: Console | None = None,
+    redraw: bool = False,
 ) -> Results:
     """Carry out an experiment, or what is missing of it, and write table, summary, report and figures.
 
@@ -75,6 +76,7 @@ def run_experiment(
         workers: Processes; by default what the experiment says.
         threads: Threads of numerical libraries in each process.
         console: Where progress is reported; standard error by default.
+        redraw: Run nothing, and ask for no data: summarise, report and draw the rows that the folder holds.
 
     Raises:
         ResultsError: The folder holds other results, or a worker was killed.
@@ -83,11 +85,13 @@ def run_experiment(
     with ExitStack() as stack:
         if out is None:
             if experiment.needs_folder:
-                raise ResultsError(f"{experiment.label} takes long and has to keep its results: give a folder (--out)")
+                raise ResultsError(
+                    f"{experiment.label} takes long and has to keep its results: give a folder (--out)"
+                )
             kept = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         else:
             kept = Path(out)
-        found = _run(experiment, kept, workers, threads, console)
+        found = _run(experiment, kept, workers, threads, console, redraw)
     return found if out is not None else Results(**{**vars(found), "files": []})
 
 
@@ -100,10 +104,10 @@ def count_missing(experiment: Experiment, out: str | Path | None = None) -> dict
     return {name: missing[name] for name in dict.fromkeys(first.values())}
 
 
-def _store(experiment: Experiment, out: Path) -> Store:
+def _store(experiment: Experiment, out: Path, redraw: bool = False) -> Store:
     if out.exists() and not out.is_dir():
         raise ResultsError(f"{out} is a file: give a folder to write to")
-    identity = experiment.identity()
+    identity = None if redraw else experiment.identity()
     if identity is None:
         return Store(out, experiment, kept_identity(out, experiment.label))
     about = {"experiment": experiment.label, "foretrace": foretrace.__version__}
@@ -111,21 +115,31 @@ def _store(experiment: Experiment, out: Path) -> Store:
 
 
 def _run(
-    experiment: Experiment, out: Path, workers: int | None, threads: int, console: Console | None
+    experiment: Experiment,
+    out: Path,
+    workers: int | None,
+    threads: int,
+    console: Console | None,
+    redraw: bool,
 ) -> Results:
     if threads < 1:
         raise ResultsError(f"threads is {threads}: give a number from 1")
     workers = experiment.workers if workers is None else workers
     workers = count_workers(workers, ResultsError)
-    trials = list(dict.fromkeys(experiment.trials()))
-    store = _store(experiment, out)
+    trials = [] if redraw else list(dict.fromkeys(experiment.trials()))
+    store = _store(experiment, out, redraw)
     done = store.done()
     missing = [trial for trial in trials if trial not in done]
     machines = store.machines()
     failures: list[Failure] = []
     if missing:
         store.prepare(done)
-        machine = {"cpu": _processor(), "workers": workers, "threads": threads, "versions": versions_of(*LIBRARIES)}
+        machine = {
+            "cpu": _processor(),
+            "workers": workers,
+            "threads": threads,
+            "versions": versions_of(*LIBRARIES),
+        }
         machine |= _device(getattr(experiment, "device", "cpu"))
         machine |= {"commit": git_commit(), "started": datetime.now(UTC).isoformat(timespec="seconds")}
         begun = time.monotonic()
@@ -222,11 +236,12 @@ def _device(name: str) -> dict[str, str]:
 
 def _in_order(done: Mapping[Trial, Rows], trials: list[Trial]) -> dict[Trial, Rows]:
     """Trials that are asked for in their order, then the others as they were."""
-    ordered = [*(trial for trial in trials if trial in done), *sorted(done.keys() - set(trials), key=str)]
-    return {trial: done[trial] for trial in ordered}
+    return {trial: done[trial] for trial in dict.fromkeys([*trials, *done]) if trial in done}
 
 
-def write_figures(figures: Mapping[str, Figure], out: Path, formats: tuple[str, ...] = ("png",)) -> list[Path]:
+def write_figures(
+    figures: Mapping[str, Figure], out: Path, formats: tuple[str, ...] = ("png",)
+) -> list[Path]:
     """Write figures; the same figure gives the same bytes. Returns the files."""
     about: dict[str, Any] = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
     files = [(figure, out / f"{name}.{ending}") for name, figure in figures.items() for ending in formats]

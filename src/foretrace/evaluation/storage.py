@@ -50,7 +50,9 @@ class Store:
             return self._archived()
         found = {}
         for file in sorted((self.folder / TRIALS).glob("*.json")):
-            content = read_versioned(file, TRIAL_FORMAT, TRIAL_VERSION, ResultsError, "remove it", key="version")
+            content = read_versioned(
+                file, TRIAL_FORMAT, TRIAL_VERSION, ResultsError, "remove it", key="version"
+            )
             self._check(content["identity"])
             found[trial_of(self.experiment.trial, content["trial"])] = content["rows"]
         return found
@@ -68,7 +70,9 @@ class Store:
         partial = self.folder / f".{TRIALS}.{os.getpid()}"
         partial.mkdir(parents=True)
         for trial, rows in done.items():
-            (partial / f"{trial.key}.json").write_text(json.dumps(self._content(trial, rows)), encoding="utf-8")
+            (partial / f"{trial.key}.json").write_text(
+                json.dumps(self._content(trial, rows)), encoding="utf-8"
+            )
         try:
             partial.rename(target)  # all at once: half of them would hide the table's other half
         except OSError:  # another process was faster
@@ -119,7 +123,9 @@ def kept_identity(folder: Path, label: str) -> dict[str, Any]:
         raise ResultsError(f"{folder} holds no results to draw: name the data to run the experiment on")
     identity = _read_summary(folder)["identity"]
     if identity.get("experiment") != label:
-        raise ResultsError(f"{folder} holds results of {identity.get('experiment')!r}, not {label!r}: choose another")
+        raise ResultsError(
+            f"{folder} holds results of {identity.get('experiment')!r}, not {label!r}: choose another"
+        )
     return identity
 
 
@@ -144,7 +150,9 @@ def read_rows(folder: str | Path, trial: type[Trial] | None = None) -> pd.DataFr
     """
     folder = Path(folder)
     if not (folder / ROWS).is_file():
-        raise ResultsError(f"{folder / ROWS} is missing: give a folder that `foretrace evaluate NAME --out` has made")
+        raise ResultsError(
+            f"{folder / ROWS} is missing: give a folder that `foretrace evaluate NAME --out` has made"
+        )
     if trial is None:
         trial = EXPERIMENTS.find(_read_summary(folder)["identity"].get("experiment")).trial
     return table_of(parse_rows(folder / ROWS, trial))
@@ -177,7 +185,9 @@ def parse_rows(file: Path, kind: type[Trial]) -> dict[Trial, Rows]:
         reader = csv.DictReader(lines)
         head = reader.fieldnames or []
         if missing := [name for name in names if name not in head]:
-            raise ResultsError(f"{file} lacks the columns {', '.join(missing)}: restore it, or remove the folder")
+            raise ResultsError(
+                f"{file} lacks the columns {', '.join(missing)}: restore it, or remove the folder"
+            )
         for number, line in enumerate(reader, 2):
             try:
                 if None in line or None in line.values():
@@ -206,7 +216,9 @@ def plain(row: Mapping[str, Any]) -> dict[str, Plain]:
         if not isinstance(value, str | int | float | bool):
             raise TypeError(f"column {name} holds {value!r}: give a text or a number")
         if isinstance(value, str) and (value == "" or not isinstance(_value(value), str)):
-            raise TypeError(f"column {name} holds the text {value!r}, which reads like a number: word it otherwise")
+            raise TypeError(
+                f"column {name} holds the text {value!r}, which reads like a number: word it otherwise"
+            )
         kept[name] = str(value) if isinstance(value, str) else value
     return kept
 
@@ -224,7 +236,9 @@ def _value(text: str) -> Plain:
 
 def _read_summary(folder: Path) -> dict[str, Any]:
     remedy = "restore it, or remove the folder"
-    return read_versioned(folder / SUMMARY, SUMMARY_FORMAT, SUMMARY_VERSION, ResultsError, remedy, key="version")
+    return read_versioned(
+        folder / SUMMARY, SUMMARY_FORMAT, SUMMARY_VERSION, ResultsError, remedy, key="version"
+    )
 
 
 def _finite(content: Any) -> Any:

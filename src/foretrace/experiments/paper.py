@@ -140,7 +140,9 @@ class Paper(Experiment):
         """The claims, and a table for each comparison."""
         parts = ["# The paper's comparisons", "## The paper's claims", *claims_markdown(self.judge(rows))]
         for experiment, by_features in summary.items():
-            metric = next((m for m in MEASURED for s in by_features.values() for c in s.values() if m in c), None)
+            metric = next(
+                (m for m in MEASURED for s in by_features.values() for c in s.values() if m in c), None
+            )
             if metric is None:
                 continue
             unit = "share with both support points right" if metric == "accuracy" else "mean error in cm"

@@ -293,4 +293,3 @@ NOVEL_CLAIMS = (
 
 CLAIMS = SUPPORT_POINT_CLAIMS + FEATURE_CLAIMS + SIZE_CLAIMS + NOVEL_CLAIMS
 """Every claim of the paper's sections 5.1 to 5.3 that a table can be asked about."""
-

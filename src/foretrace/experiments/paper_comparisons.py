@@ -159,7 +159,11 @@ ABLATIONS: dict[str, tuple[str, Mapping[str, Option]]] = {
 
 COMPARISONS: dict[str, Comparison] = {
     "support-points": Comparison(
-        _SUPPORT, ("5", "10", "25", "50", "75", "100"), _share_of_training, ratio=_ratio_of_share, of_corners=True
+        _SUPPORT,
+        ("5", "10", "25", "50", "75", "100"),
+        _share_of_training,
+        ratio=_ratio_of_share,
+        of_corners=True,
     ),
     "support-points-novel": Comparison(
         _SUPPORT, CORNERS, _novel_corners, ratio=_ratio_of_corners, of_corners=True
@@ -175,7 +179,11 @@ COMPARISONS: dict[str, Comparison] = {
     "steps-ahead": Comparison(_FEATURES, ("2", "3", "4", "5"), shuffled, varies_steps=True),
     "novel-corners": Comparison(_ALL, CORNERS, _novel_corners, ratio=_ratio_of_corners),
     "more-data": Comparison(
-        ("none", *_OTHERS), ("2000", "5000", "10000", "20000"), _count_of_all, ratio=_ratio_of_count, on_request=True
+        ("none", *_OTHERS),
+        ("2000", "5000", "10000", "20000"),
+        _count_of_all,
+        ratio=_ratio_of_count,
+        on_request=True,
     ),
     "ablation": Comparison(tuple(ABLATIONS), ("shuffled",), shuffled, predictors=ABLATIONS),
 }

@@ -36,7 +36,7 @@ from foretrace.experiments.paper_claims import (
     TASK_SPECIFIC,
 )
 from foretrace.experiments.paper_comparisons import COMPARISONS
-from foretrace.pictures.scene import DPI, INK, STYLE
+from foretrace.pictures.style import DPI, INK, STYLE
 
 PANELS = {
     "Shape context": SHAPE_CONTEXTS,
@@ -165,7 +165,9 @@ def draw_panels(
     ratio = COMPARISONS[experiment].ratio
     numbers = {name: intervals(rows, name, settings, ratio=ratio) for name in present(rows)}
     panels = {title: [name for name in names if name in numbers] for title, names in PANELS.items()}
-    panels["Others"] = [name for name in numbers if name != "none" and not any(name in p for p in PANELS.values())]
+    panels["Others"] = [
+        name for name in numbers if name != "none" and not any(name in p for p in PANELS.values())
+    ]
     panels = {title: names for title, names in panels.items() if names} or {"No feature": []}
     axes = fig.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     top = 1.06 * max(np.nanmax(part) for part in numbers.values())
@@ -254,4 +256,3 @@ FIGURES: dict[str, Callable[[pd.DataFrame], Figure | None]] = {
     "figure-13": figure_13,
 }
 """Every figure by the name of its files."""
-

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from foretrace.errors import TrainingError
 from foretrace.features import Option, make_features
+from foretrace.files import short_hash
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import Split
 from foretrace.predictor import RECIPES, EffectPredictor, TrainConfig, train_predictor
-from foretrace.predictor.checkpoint import settings_of
-from foretrace.predictor.run_folder import Progress
+from foretrace.predictor.checkpoint import default_checkpoint, settings_of
+from foretrace.predictor.run_folder import MODEL, Progress
 from foretrace.predictor.states import valid_lengths
 from foretrace.predictor.training import fit_predictor
 
@@ -88,3 +89,9 @@ def load_levered(data: str | Path) -> InteractionBatch:
     """The interactions of a data set that the paper learns from: levered, and at least two samples long."""
     batch = Dataset.open(data).where(outcome=str(Outcome.LEVERED)).batch()
     return batch[valid_lengths(batch) >= 2]
+
+
+def weights_of(run: Path | None) -> str | None:
+    """A checksum of a trained predictor's weights; None stands for the predictor that comes with foretrace."""
+    folder = default_checkpoint() if run is None else run
+    return short_hash((folder / MODEL).read_bytes()) if (folder / MODEL).is_file() else None
