@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pandas as pd
-
 from foretrace.experiments.claims import PAIRS, PAPER_FEATURES, SIZES
 
 COLUMNS = ["experiment", "features", "seed", "setting", "metric", "value"]

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-
 from foretrace.evaluation.judging import MIN_SEEDS, Cell, Check, by_cell, summarise
 from foretrace.experiments.claims import CLAIMS, PAIRS, holds_in_words, judge_claims, tally, write_claims
+
 from result_tables import COLUMNS, in_every_seed, paper_like
 
 

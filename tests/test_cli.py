@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from foretrace.evaluation.results import read_results
 
 import factories
 from foretrace import cli
-from foretrace.evaluation.results import read_results
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.predictor.training import fit_predictor

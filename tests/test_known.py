@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
+from foretrace.experiments.paper_protocol import Recipe
 from safetensors.torch import load_file
 
 from factories import fake_batch
@@ -13,7 +14,6 @@ from foretrace.cli import main
 from foretrace.cli.learning import _told_values
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
-from foretrace.experiments.paper_protocol import Recipe
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed

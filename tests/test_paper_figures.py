@@ -4,13 +4,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from foretrace.evaluation.results import ResultsTable, Trial
+from foretrace.experiments.charts import seeds_in_words
+from foretrace.experiments.claims import CLAIMS
 from matplotlib.figure import Figure
 from PIL import Image
 
 from foretrace import cli
-from foretrace.evaluation.results import ResultsTable, Trial
-from foretrace.experiments.charts import seeds_in_words
-from foretrace.experiments.claims import CLAIMS
 from foretrace.experiments.paper_figures import FIGURES, write_figures
 from result_tables import ERRORS, paper_like
 

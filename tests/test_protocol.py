@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from foretrace.evaluation.results import Metrics, ResultsTable, Trial, read_results
+from foretrace.evaluation.runner import run_trials
+from foretrace.experiments.paper_protocol import Recipe, count_missing, load_levered, run_protocol
+from foretrace.experiments.paper_trials import EXPERIMENTS, plan, split_of
 from rich.console import Console
 
 import factories
 from foretrace.errors import ResultsError, TrainingError
 from foretrace.evaluation.metrics import evaluate_predictor, measure_errors
-from foretrace.evaluation.results import Metrics, ResultsTable, Trial, read_results
-from foretrace.evaluation.runner import run_trials
 from foretrace.experiments import paper_protocol as protocol
-from foretrace.experiments.paper_protocol import Recipe, count_missing, load_levered, run_protocol
-from foretrace.experiments.paper_trials import EXPERIMENTS, plan, split_of
 from foretrace.features import FEATURES
 from foretrace.interactions.record import Outcome
 from foretrace.predictor import RECIPES, TrainConfig

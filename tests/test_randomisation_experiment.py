@@ -3,6 +3,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foretrace.evaluation.results import Trial, read_results
+from foretrace.experiments.randomisation_report import (
+    BARS,
+    JUDGES,
+    NOMINAL,
+    markdown,
+    randomisation_figure,
+    summarise,
+)
 from rich.console import Console
 
 import factories
@@ -10,7 +19,6 @@ from engines_at_hand import WITHOUT_BULLET
 from foretrace.actions import LeverUp, Stroke, ToolPath
 from foretrace.cli import main
 from foretrace.errors import DatasetError, ResultsError
-from foretrace.evaluation.results import Trial, read_results
 from foretrace.experiments import randomisation
 from foretrace.experiments.randomisation import (
     KNOWING,
@@ -23,14 +31,6 @@ from foretrace.experiments.randomisation import (
     open_both,
     run_randomisation,
     split_both,
-)
-from foretrace.experiments.randomisation_report import (
-    BARS,
-    JUDGES,
-    NOMINAL,
-    markdown,
-    randomisation_figure,
-    summarise,
 )
 from foretrace.experiments.transfer_objects import PENTAGON, Subject
 from foretrace.imagined import ImaginedBatch

@@ -3,8 +3,6 @@ import multiprocessing
 from pathlib import Path
 
 import pytest
-
-from foretrace.errors import ResultsError
 from foretrace.evaluation.results import (
     DESCRIPTION,
     TABLE,
@@ -14,6 +12,8 @@ from foretrace.evaluation.results import (
     finished_trials,
     read_results,
 )
+
+from foretrace.errors import ResultsError
 
 IDENTITY = {"data": "abc", "recipe": {"epochs": 3, "options": {}}}
 FIRST = Trial("features", "none", 0, "shuffled")

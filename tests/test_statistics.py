@@ -1,9 +1,9 @@
 import numpy as np
 import pandas as pd
 import pytest
+from foretrace.evaluation.results import COLUMNS
 
 from foretrace.errors import ResultsError
-from foretrace.evaluation.results import COLUMNS
 from foretrace.evaluation.statistics import mean_interval, paired_difference
 
 

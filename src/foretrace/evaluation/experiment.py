@@ -85,8 +85,8 @@ class Experiment(ABC):
     ``cached_property`` that reads a data set, is worked out once in each process.
     """
 
-    label: ClassVar[str]
-    """Name on the command line."""
+    label: ClassVar[str] = ""
+    """Name on the command line; empty for a base class, or an experiment that is run from Python only."""
     summary: ClassVar[str]
     """What it answers, in a line."""
     trial: ClassVar[type[Trial]]
@@ -110,7 +110,8 @@ class Experiment(ABC):
         return {each.name: getattr(self, each.name) for each in fields(self)}  # pyright: ignore[reportArgumentType]
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        self.__dict__.update(state)
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
 
     @abstractmethod
     def trials(self) -> Sequence[Trial]:

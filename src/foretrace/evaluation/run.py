@@ -110,7 +110,7 @@ def _store(experiment: Experiment, out: Path, redraw: bool = False) -> Store:
     identity = None if redraw else experiment.identity()
     if identity is None:
         return Store(out, experiment, kept_identity(out, experiment.label))
-    about = {"experiment": experiment.label, "foretrace": foretrace.__version__}
+    about = {"experiment": experiment.label or type(experiment).__name__, "foretrace": foretrace.__version__}
     return Store(out, experiment, as_json(about | identity))
 
 
@@ -165,7 +165,7 @@ def _carry_out(
     """Run trials and keep each as soon as it is finished."""
     failures = []
     work = _Work(store, threads)
-    with ProgressReport("trials", total, total - len(missing), console, period=0) as report:
+    with ProgressReport("trials", total, total - len(missing), console, period=0.0) as report:
         finished = run_jobs(work, missing, workers, error=ResultsError, threads=threads, ahead="n_jobs")
         for trial, message, text in finished:
             if message is not None:

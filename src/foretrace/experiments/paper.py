@@ -123,12 +123,12 @@ class Paper(Experiment):
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
         """By comparison, features, setting and metric: mean over the seeds, 95 % interval, standard deviation."""
         summary: dict[str, Any] = {}
-        columns = ["mean", "low", "high", "std", "seeds"]
         for line in cell_table(self._with_more(rows), ratio_of).to_dict("records"):
             place = summary
             for name in ("experiment", "features", "setting"):
                 place = place.setdefault(line[name], {})
-            place[line["metric"]] = {name: _rounded(line[name]) for name in columns}
+            numbers = {name: _rounded(line[name]) for name in ("mean", "low", "high", "std")}
+            place[line["metric"]] = numbers | {"seeds": line["seeds"]}
         return summary
 
     def judge(self, rows: pd.DataFrame) -> list[dict[str, Any]]:

@@ -70,6 +70,10 @@ class Recipe:
         left_out = (*_OF_THE_TRIAL, *_WHERE)
         return {name: value for name, value in settings_of(self.training).items() if name not in left_out}
 
+    def make(self, num_samples: int) -> EffectPredictor:
+        """The untrained predictor of motions with this many samples."""
+        return self.training.make_predictor(num_samples)
+
     def inputs(self, batch: InteractionBatch) -> Tensor:
         """Inputs of the features for a whole batch."""
         return make_features(self.training.features, **self.training.feature_options).inputs(batch)
