@@ -34,7 +34,7 @@ from foretrace.evaluation.storage import (
 )
 from foretrace.experiments.training import Recipe
 from foretrace.experiments.transfer_objects import PENTAGON, Subject
-from foretrace.predictor import save_checkpoint, train_predictor
+from foretrace.predictor import PREDICTORS, save_checkpoint, train_predictor
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.stand_in import StandIn
@@ -60,7 +60,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = QUICK["lstm"].change(
         features="ae-256", feature_options=factories.QUICK_OPTIONS["ae-256"], split=(30, 4, 6)
     )
-    train_predictor(Dataset.open(root / "plain"), recipe.training, root / "run", progress=False)
+    train_predictor(Dataset.open(root / "plain"), recipe.predictor, root / "run", recipe.training, progress=False)
     save_checkpoint(root / "untrained", QUICK["lstm"].change(features="none").make(60))
     return root
 

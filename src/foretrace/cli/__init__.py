@@ -11,7 +11,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Union
 
 import tyro
@@ -45,13 +45,12 @@ class Group:
     """Each by its name within the group."""
 
 
+EVALUATE = "Run an experiment, or go on with it: rows, summary, report and figures."
 COMMANDS: dict[str, Command | Group] = {
     "demo": demo,
     "simulate": simulate,
     "train": train,
-    "evaluate": Group(
-        "Run an experiment, or go on with it: rows, summary, report and figures.", experiment_commands()
-    ),
+    "evaluate": Group(EVALUATE, experiment_commands()),
     "card": card,
     "predict": predict,
     "export": Group(
@@ -111,13 +110,9 @@ def _run(arguments: Sequence[str]) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:
-            commands = dict(COMMANDS)
-            if list(arguments[:1]) == ["evaluate"]:
-                commands["evaluate"] = replace(
-                    COMMANDS["evaluate"], commands=experiment_commands(arguments[1:2])
-                )
+            named = arguments[1:2] if list(arguments[:1]) == ["evaluate"] else ()
             status = tyro.cli(
-                _choice(commands),
+                _choice(COMMANDS | {"evaluate": Group(EVALUATE, experiment_commands(named))}),
                 prog="foretrace",
                 description="Predict how an object will move before the robot touches it.",
                 args=arguments,

@@ -30,11 +30,12 @@ from foretrace.evaluation.tables import capitalised, markdown_table, mean_with_i
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.non_flat_data import KINDS, SETTINGS, NonFlatData, Setting
 from foretrace.experiments.non_flat_figures import errors_figure, paths_figure
-from foretrace.experiments.training import BASE, Device, Recipe
+from foretrace.experiments.training import BASE, Recipe
 from foretrace.features import Option
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor import EffectPredictor, load_predictor
+from foretrace.predictor.config import Device
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_lengths, valid_samples
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
@@ -50,7 +51,7 @@ CHANNEL_OPTIONS: dict[str, dict[Channel, dict[str, Option]]] = {
     "outline": {name: {"heights": name == "height"} for name in CHANNELS},
 }
 """Options of features that can be computed from either channel."""
-LARGER: dict[str, tuple[dict[str, Any], dict[str, Option]]] = {"one-shot": ({"hidden": 192}, {"motions": 64})}
+LARGER: dict[str, dict[str, Any]] = {"one-shot": {"hidden": 192, "components": 64}}
 """Settings of predictors that are larger here: objects that roll and tumble move in more ways."""
 NEARLY = 0.0005
 """Two lever-ups whose contacts lie this far to either side of a third one are nearly equal to it [m]."""
@@ -161,9 +162,9 @@ class NonFlat(Experiment):
         sensitivity = {
             name: {
                 "probes": len(part),
-                "irreducible_cm": round(float(part["irreducible_cm"].mean()), 4),
-                "median_irreducible_cm": round(float(part["irreducible_cm"].median()), 4),
-                "same_outcome": round(float(part["same"].astype(float).mean()), 4),
+                "irreducible_cm": round(float(np.mean(part["irreducible_cm"].to_numpy(float))), 4),
+                "median_irreducible_cm": round(float(np.median(part["irreducible_cm"].to_numpy(float))), 4),
+                "same_outcome": round(float(np.mean(part["same"].to_numpy(float))), 4),
             }
             for name, part in by_kind.items()
             if len(part)
@@ -217,14 +218,13 @@ class NonFlat(Experiment):
     def _recipe(self) -> Recipe:
         recipe = self.recipe
         if recipe is None:
-            settings, options = LARGER.get(self.predictor, ({}, {}))
-            recipe = Recipe.of(self.predictor).change(options, **settings)
+            recipe = Recipe.of(self.predictor).change(**LARGER.get(self.predictor, {}))
         if recipe.features not in CHANNEL_OPTIONS:
             raise ResultsError(
                 f"features {recipe.features!r} of {self.predictor} do not come from both masks and height maps: "
                 f"choose a predictor with {' or '.join(CHANNEL_OPTIONS)}"
             )
-        return recipe.change(epochs=self.epochs, device=self.device, threads=1)
+        return recipe.change(epochs=self.epochs, device=self.device)
 
     def _train(self, channel: Channel, trial: NonFlatTrial, split: Split, folder: Path) -> Path:
         options = CHANNEL_OPTIONS[self._recipe.features][channel]

@@ -32,11 +32,12 @@ from foretrace.experiments.paper_comparisons import (
 )
 from foretrace.experiments.paper_figures import FIGURES
 from foretrace.experiments.support_points import support_point_metrics
-from foretrace.experiments.training import BASE, Device, Recipe, load_levered
+from foretrace.experiments.training import BASE, Recipe, load_levered
 from foretrace.features import FEATURES, Option
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES
 from foretrace.predictor import PREDICTORS
+from foretrace.predictor.config import Device
 from foretrace.predictor.run_folder import fingerprint
 
 FITTED = "fitted"
@@ -165,13 +166,13 @@ class Paper(Experiment):
     def recipe_of(self, trial: PaperTrial) -> Recipe:
         """How a trial's predictor is made and trained."""
         comparison = COMPARISONS[trial.experiment]
-        where = {"seed": trial.seed, "device": self.device, "threads": 1}
+        where = {"seed": trial.seed, "device": self.device}
         if trial.features in FEATURES:
             steps = int(trial.setting) if comparison.varies_steps else None
             features = {"features": trial.features, "feature_options": self._options(trial)}
             return self._recipe(BASE).change(**features, steps_ahead=steps, **where)
         predictor, options = comparison.predictors.get(trial.features, (trial.features, {}))
-        return self._recipe(predictor).change(options, **where)
+        return self._recipe(predictor).change(**options, **where)
 
     @cached_property
     def _levered(self) -> InteractionBatch:

@@ -150,10 +150,10 @@ _OTHERS = tuple(label for label in PREDICTORS if label != BASE)
 """Predictors that are compared as they are, each with its own features, as if they were other features."""
 _ALL = (*_FEATURES, *_OTHERS)
 ABLATIONS: dict[str, tuple[str, Mapping[str, Option]]] = {
-    "one hinge": ("one-shot", {"hinges": 1}),
-    "one network": ("one-shot", {"members": 1}),
+    "one hinge": ("one-shot", {"pivot_edges": 1}),
+    "one network": ("one-shot", {"ensemble": 1}),
     "no mirror": ("one-shot", {"mirrored": False}),
-    "8 motions": ("one-shot", {"motions": 8}),
+    "8 motions": ("one-shot", {"components": 8}),
 }
 """What the direct trajectory predictor is without one of its parts."""
 

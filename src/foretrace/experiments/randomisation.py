@@ -36,12 +36,12 @@ from foretrace.experiments.training import BASE, Recipe, load_levered
 from foretrace.experiments.transfer import distance_until_slip
 from foretrace.experiments.transfer_objects import Subject, everyday_objects, play, printed_shapes
 from foretrace.features import FEATURES
+from foretrace.imagined.context import CONSTANTS, CONTEXT, check_names, column_of, true_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
 from foretrace.pictures.style import DPI, GREY, INK, STYLE
 from foretrace.predictor import EffectPredictor
-from foretrace.predictor.context import CONSTANTS, KNOWN, check_names, true_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 
@@ -117,7 +117,7 @@ def open_both(plain: str | Path, varied: str | Path, names: Sequence[str] = NAME
     both = Both(load_levered(plain), load_levered(varied))
     for name in names:
         remedy = "--randomise" if name in CONSTANTS else "--vary-action"
-        spans = [np.ptp(getattr(batch, name)) if len(batch) else 0.0 for batch in both]
+        spans = [np.ptp(column_of(batch, name)) if len(batch) else 0.0 for batch in both]
         if spans[0] > 0:
             raise ResultsError(f"{name} varies in {plain}: simulate the plain data without {remedy}")
         if spans[1] == 0:
@@ -183,7 +183,7 @@ class RandomisationExperiment(Experiment):
     """Seeds of splits and trainings."""
     repeats: int = 3
     """Lever-ups by the stand-in at every contact; 0 leaves it out. It levers with the nominal action."""
-    known: tuple[str, ...] = NAMES
+    context: tuple[str, ...] = NAMES
     """What varies, and is told to some of the predictors: as in `foretrace train`."""
     predictor: str = BASE
     """Kind of predictor: lstm or one-shot."""
@@ -199,9 +199,9 @@ class RandomisationExperiment(Experiment):
     trial = RandomisationTrial
 
     def __post_init__(self) -> None:
-        check_names(self.known)
-        if not self.known:
-            raise ResultsError(f"no varying quantity is named: name what varies, of {', '.join(KNOWN)}")
+        check_names(self.context)
+        if not self.context:
+            raise ResultsError(f"no varying quantity is named: name what varies, of {', '.join(CONTEXT)}")
         if self.repeats < 0:
             raise ResultsError(
                 f"repeats is {self.repeats}, it must not be negative: 0 leaves out the stand-in"
@@ -225,19 +225,19 @@ class RandomisationExperiment(Experiment):
         if self.plain is None and self.varied is None:
             return None
         data = {
-            name: fingerprint(batch, self.known)
+            name: fingerprint(batch, self.context)
             for name, batch in zip((PLAIN, VARIED), self._both, strict=True)
         }
         described = {"training": self._recipe.describe(), "stand_in": asdict(self.stand_in)}
-        described |= {"repeats": self.repeats, "known": list(self.known)}
+        described |= {"repeats": self.repeats, "context": list(self.context)}
         return {"data": data, "recipe": described}
 
     def run(self, trial: RandomisationTrial, folder: Path) -> Sequence[Row]:
         """Errors over the full trajectory on both test parts, distances from the stand-in [cm], and seconds."""
         splits = split_both(self._both, trial.seed)
         source = 0 if trial.setting == PLAIN else 1
-        known = self.known if trial.setting == KNOWING else ()
-        recipe = self._recipe.change(features=trial.features, known=known, seed=trial.seed)
+        context = self.context if trial.setting == KNOWING else ()
+        recipe = self._recipe.change(features=trial.features, context=context, seed=trial.seed)
         inputs = self._inputs(recipe)
         started = perf_counter()
         predictor, _ = recipe.fit(self._both[source], splits[source], inputs[source])
@@ -247,12 +247,12 @@ class RandomisationExperiment(Experiment):
             test, test_inputs = batch[split.test], all_inputs[split.test]
             errors = measure_errors(predictor, test, test_inputs)
             found |= {f"{name}_full": errors["full"], f"{name}_final": errors["final"]}
-            if predictor.known:
+            if predictor.context:
                 errors = measure_errors(predictor, _nominal(test), test_inputs)
                 found[f"{name}_nominal_full"] = errors["full"]
         if self.repeats:
             found |= distances(predictor, self._shown)
-            if predictor.known:
+            if predictor.context:
                 nominal = distances(predictor, self._shown, nominal=True)
                 found |= {f"{name}_nominal": value for name, value in nominal.items()}
         found |= {"train": float(len(splits[source].train)), "seconds": seconds}
@@ -306,22 +306,22 @@ class RandomisationExperiment(Experiment):
     @cached_property
     def _recipe(self) -> Recipe:
         recipe = Recipe.of(self.predictor) if self.recipe is None else self.recipe
-        return recipe.change(epochs=self.epochs, device="cpu", threads=1)
+        return recipe.change(epochs=self.epochs, device="cpu")
 
     @cached_property
     def _both(self) -> Both:
         if self.plain is None or self.varied is None:
             raise ResultsError("one of the two data sets is missing: give both --plain and --varied")
-        return open_both(self.plain, self.varied, self.known)
+        return open_both(self.plain, self.varied, self.context)
 
     def _inputs(self, recipe: Recipe) -> tuple[Tensor, ...]:
         """Inputs of features for both data sets, once in each process."""
-        if recipe.features not in self._known_inputs:
-            self._known_inputs[recipe.features] = tuple(recipe.inputs(batch) for batch in self._both)
-        return self._known_inputs[recipe.features]
+        if recipe.features not in self._inputs_by_features:
+            self._inputs_by_features[recipe.features] = tuple(recipe.inputs(batch) for batch in self._both)
+        return self._inputs_by_features[recipe.features]
 
     @cached_property
-    def _known_inputs(self) -> dict[str, tuple[Tensor, ...]]:
+    def _inputs_by_features(self) -> dict[str, tuple[Tensor, ...]]:
         return {}
 
     @cached_property
@@ -354,9 +354,9 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     batch = InteractionBatch.from_views(views, times)
     start: Float[np.ndarray, "batch 3"] = np.array([each.observed.com[0] for each in shown])
     told = [Physics(density=each.subject.density) if nominal else each.observed.physics for each in shown]
-    values = [true_values(physics, tuple(KNOWN)) for physics in told]
-    known = {name: np.array([each[name] for each in values]) for name in KNOWN}
-    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), **known)
+    values = [true_context(physics, tuple(CONTEXT)) for physics in told]
+    context = {name: np.array([each[name] for each in values]) for name in CONTEXT}
+    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), **context)
     imagined = predictor.imagine_batch(batch).com
     values = np.array(
         [distance_until_slip(each.observed, times, path) for each, path in zip(shown, imagined, strict=True)]
@@ -367,7 +367,7 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
 
 def _nominal(batch: InteractionBatch) -> InteractionBatch:
     """The same interactions with the nominal constants and action parameters."""
-    values = true_values(Physics(), tuple(KNOWN))
+    values = true_context(Physics(), tuple(CONTEXT))
     return replace(batch, **{name: np.full(len(batch), value) for name, value in values.items()})
 
 

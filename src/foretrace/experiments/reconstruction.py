@@ -86,8 +86,11 @@ class Reconstruction(Experiment):
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
         """By training: features, and the mean and the worst overlap (intersection over union)."""
         return {
-            name: {"features": part["features"].iloc[0], "iou_mean": round(float(part["iou"].mean()), 4)}
-            | {"iou_worst": round(float(part["iou"].min()), 4), "masks": len(part)}
+            str(name): {
+                "features": part["features"].iloc[0],
+                "iou_mean": round(float(np.mean(part["iou"].to_numpy(float))), 4),
+            }
+            | {"iou_worst": round(float(np.min(part["iou"].to_numpy(float))), 4), "masks": len(part)}
             for name, part in rows.groupby("training", sort=False)
         }
 

@@ -40,11 +40,11 @@ from foretrace.experiments.transfer_objects import (
     read_silhouettes,
 )
 from foretrace.experiments.transfer_report import PAPER_OBJECTS, RECORDED, recorded_report, report, summarise
+from foretrace.imagined.context import true_context
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor import EffectPredictor, load_predictor
-from foretrace.predictor.context import true_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
@@ -330,10 +330,10 @@ def compare(
     if len(observed.com) == 0:
         return row, np.empty((0, 3))
     physics = observed.physics if told is None else told
-    known = true_values(physics, predictor.known)
-    start = predictor.imagine(view, observed.com[0], known)
+    context = true_context(physics, predictor.context)
+    start = predictor.imagine(view, context=context, com=observed.com[0])
     imagined = start.com_trajectory[_before(start.times, slip)]
-    blind = predictor.imagine(view, known=known)
+    blind = predictor.imagine(view, context=context)
     row["distance_predicted_cm"] = distance_until_slip(observed, start.times, start.com_trajectory)
     row["distance_predicted_from_view_cm"] = distance_until_slip(observed, blind.times, blind.com_trajectory)
     row["final_predicted_cm"] = CM * float(np.linalg.norm(imagined[-1] - observed.com[-1]))
@@ -352,8 +352,8 @@ def own_error(predictor: EffectPredictor, view: TopDownView, simulated: Interact
     effect = simulated.effect
     if len(effect.times) == 0:
         return np.nan
-    known = true_values(simulated.physics, predictor.known, simulated.stroke)
-    imagined = predictor.imagine(view, effect.com_trajectory[0], known).com_trajectory
+    context = true_context(simulated.physics, predictor.context, asdict(simulated.stroke))
+    imagined = predictor.imagine(view, context=context, com=effect.com_trajectory[0]).com_trajectory
     end = slice(None) if effect.slip_index is None else slice(max(1, effect.slip_index))
     return CM * warped_distance(effect.com_trajectory[end], imagined[end]).distance
 

@@ -92,7 +92,7 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     if everyday:
         bars.append(_bar("every everyday object", everyday, rows.loc[rows["group"].eq("everyday")], GOAL))
     note = RECORDED_NOTE if RECORDED in set(rows["group"]) else NOTE
-    repeats = int(rows["repetition"].max()) + 1
+    repeats = int(rows["repetition"].to_numpy().max()) + 1
     about = {"note": note, "repeats": repeats}
     return {**about, "edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
 

@@ -21,7 +21,7 @@ from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seed
 from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval
 from foretrace.experiments import SUMMARIES
-from foretrace.experiments.training import Device, Recipe
+from foretrace.experiments.training import Recipe
 from foretrace.experiments.uncertainty_figures import (
     BEGINNING_WORDS,
     SPLIT_WORDS,
@@ -50,6 +50,7 @@ from foretrace.experiments.uncertainty_metrics import (
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
 from foretrace.predictor import OneShotPredictor, load_predictor
+from foretrace.predictor.config import Device
 from foretrace.predictor.one_shot import FEW
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_lengths
@@ -222,7 +223,7 @@ class Uncertainty(Experiment):
     @cached_property
     def _recipe(self) -> Recipe:
         recipe = Recipe.of(OneShotPredictor.label) if self.recipe is None else self.recipe
-        return recipe.change(epochs=self.epochs, device=self.device, threads=1)
+        return recipe.change(epochs=self.epochs, device=self.device)
 
     def _split(self, trial: UncertaintyTrial) -> Split:
         return split_of(self._batch, trial.split, trial.seed, self.held_out)

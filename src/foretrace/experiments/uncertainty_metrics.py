@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foretrace.evaluation.metrics import METRICS
-from foretrace.imagined import LEVELS
+from foretrace.imagined import LEVELS, Futures, ImaginedBatch
+from foretrace.imagined.context import recorded_context
 from foretrace.interactions.dataset import InteractionBatch
-from foretrace.predictor import Futures, ImaginedBatch, OneShotPredictor
-from foretrace.predictor.context import observed_values
+from foretrace.predictor import OneShotPredictor
 from foretrace.predictor.mixture import Mixture
 from foretrace.predictor.states import decode_poses, encode_states
 from foretrace.trajectories import mean_distance, rotation_error
@@ -71,7 +71,7 @@ class Part:
     def of(cls, predictor: OneShotPredictor, batch: InteractionBatch) -> "Part":
         """As prepared for a predictor."""
         features = predictor.compute_features(predictor.features.inputs(batch))
-        features = predictor.add_known(features, observed_values(batch, predictor.known))
+        features = predictor.add_context(features, recorded_context(batch, predictor.context))
         valid = np.arange(batch.com.shape[1]) < batch.length[:, None]
         return cls(batch, features, encode_states(batch, predictor.state, batch.length), valid)
 
