@@ -34,7 +34,7 @@ from foretrace.evaluation.storage import (
 )
 from foretrace.experiments.training import Recipe
 from foretrace.experiments.transfer_objects import PENTAGON, Subject
-from foretrace.predictor import PREDICTORS, save_checkpoint, train_predictor
+from foretrace.predictor import save_checkpoint, train_predictor
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.stand_in import StandIn

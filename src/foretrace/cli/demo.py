@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foretrace.objects.shape_files import read_silhouette_image
 
 if TYPE_CHECKING:
     from foretrace.interactions.record import Interaction
@@ -99,6 +98,7 @@ def _racket() -> "tuple[Interaction, TopDownView]":
     from foretrace.actions import LeverUp
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import Prism
+    from foretrace.objects.shape_files import read_silhouette_image
     from foretrace.simulation.lever_up import simulate_lever_up
 
     mask = read_silhouette_image(Path(__file__).parents[1] / "assets" / "racket.png")
