@@ -16,7 +16,7 @@ from foretrace.interactions.record import Effect, Interaction, Outcome, Physics,
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
 from foretrace.simulation.collect import CollectConfig, collect, trial
-from foretrace.simulation.randomisation import NOTHING, RANDOMISED
+from foretrace.simulation.randomisation import NOTHING, Randomisation
 
 SAMPLE_PERIOD = 0.05
 FINAL_TILT = np.radians(40)
@@ -109,13 +109,15 @@ def fake_lever_up(
     )
 
 
-def fake_data_set(folder: Path, randomised: bool = False, objects: int = 8, num_samples: int = 12) -> Path:
-    """A data set of made-up motions, with varied constants and more slips if randomised."""
-    config = CollectConfig(objects, 1, randomisation=RANDOMISED if randomised else NOTHING)
+def fake_data_set(
+    folder: Path, drawn: Randomisation = NOTHING, objects: int = 8, num_samples: int = 12
+) -> Path:
+    """A data set of made-up motions, with what varies drawn as told, and then more slips."""
+    config = CollectConfig(objects, 1, randomisation=drawn)
 
     def simulate(config: CollectConfig, id: int) -> Interaction:
         obj, action, seed = trial(config, id)
-        outcome = Outcome.SLIPPED if id % (5 if randomised else 13) == 3 else Outcome.LEVERED
+        outcome = Outcome.SLIPPED if id % (13 if drawn == NOTHING else 5) == 3 else Outcome.LEVERED
         made = fake_lever_up(obj, action, id=id, seed=seed, num_samples=num_samples, outcome=outcome)
         _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
         return replace(made, physics=physics, stroke=Stroke.of(path))

@@ -37,6 +37,7 @@ from foretrace.experiments.transfer_objects import PENTAGON, Subject
 from foretrace.predictor import save_checkpoint, train_predictor
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.stand_in import StandIn
 
 QUIET = Console(quiet=True)
@@ -51,8 +52,8 @@ STAND_IN = StandIn(engine="mujoco", embodiment="tool", sample_rate=25.0)
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with small data sets and trainings for all experiments."""
     root = tmp_path_factory.mktemp("experiments")
-    for name, randomised in (("plain", False), ("varied", True)):
-        factories.fake_data_set(root / name, randomised=randomised)
+    factories.fake_data_set(root / "plain")
+    factories.fake_data_set(root / "varied", RANDOMISED)
     tool = SimulationConfig(embodiment="tool", watch_time=1.5)
     collect(CollectConfig(9, 1, 0, tool, "solids"), root / "solids", 1, console=QUIET)
     from foretrace.interactions.dataset import Dataset

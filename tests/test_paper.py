@@ -1,6 +1,8 @@
 """The paper's comparisons: their plan, their splits, and that their numbers are those of a training by hand."""
 
 from collections import Counter
+from dataclasses import fields, replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from foretrace.experiments.paper import Paper
 from foretrace.experiments.paper_comparisons import COMPARISONS, PaperTrial, plan, ratio_of, split_of
 from foretrace.experiments.training import Recipe, load_levered
 from foretrace.features import FEATURES
+from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import PREDICTORS
 
 QUICK = {name: Recipe.of(name).change(hidden=8, epochs=1, min_steps=1) for name in PREDICTORS}
@@ -108,18 +111,34 @@ def test_the_shuffled_setting_is_what_train_and_evaluate_would_give(data, result
         assert stored[(*key, f"{metric}_median")] == pytest.approx(expected[metric]["median_cm"], rel=1e-6)
 
 
+@cache
+def many(size: int) -> InteractionBatch:
+    """A batch of any size, in little more than name: its images and motions are those of one interaction."""
+    few = factories.fake_batch(np.random.default_rng(0), 16, num_samples=20)
+    wide = {
+        each.name: np.broadcast_to(getattr(few, each.name)[:1], (size, *getattr(few, each.name).shape[1:]))
+        for each in fields(few)
+        if np.ndim(getattr(few, each.name)) > 1
+    }
+    flat = {
+        each.name: getattr(few, each.name)[np.arange(size) % 16]
+        for each in fields(few)
+        if np.ndim(getattr(few, each.name)) == 1 and each.name != "times"
+    }
+    return replace(few, **wide, **flat)
+
+
 @pytest.fixture(scope="module")
 def paper_batch():
     """As many levered interactions as the paper has, in little more than name."""
-    few = factories.fake_batch(np.random.default_rng(0), 16, num_samples=20)
-    return few[np.arange(1814) % 16]
+    return many(1814)
 
 
 @pytest.mark.parametrize("proportional", [False, True])
 @pytest.mark.parametrize("name", COMPARISONS)
 def test_no_trial_is_tested_on_what_it_learned_from(name, proportional, paper_batch):
     if COMPARISONS[name].on_request:  # of more data than the paper's
-        paper_batch = paper_batch[np.arange(26_000) % len(paper_batch)]
+        paper_batch = many(26_000)
     for chosen in plan([name], seeds=[0, 3]):
         split = split_of(chosen, paper_batch, proportional)
         parts = [set(split.train), set(split.validation), set(split.test)]
