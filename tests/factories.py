@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from foretrace.actions import LeverUp, Stroke, ToolPath
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.geometry import continuous_quaternions, matrix_to_pose
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
@@ -120,7 +120,7 @@ def fake_data_set(
         outcome = Outcome.SLIPPED if id % (13 if drawn == NOTHING else 5) == 3 else Outcome.LEVERED
         made = fake_lever_up(obj, action, id=id, seed=seed, num_samples=num_samples, outcome=outcome)
         _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
-        return replace(made, physics=physics, stroke=Stroke.of(path))
+        return replace(made, physics=physics, action=replace(made.action, path=path))
 
     collect(config, folder, workers=1, console=Console(quiet=True), simulate=simulate)
     return folder

@@ -128,12 +128,12 @@ def test_the_context_is_the_stand_ins_constants_or_the_nominal_ones(shown, monke
     found = distances(predictor, shown)
     distances(predictor, shown, nominal=True)
     true, nominal = seen
-    np.testing.assert_allclose(true.friction, [each.observed.perturbation.friction for each in shown])
+    np.testing.assert_allclose(true.parameters["friction"], [each.observed.perturbation.friction for each in shown])
     factors = [each.observed.perturbation.density_factor for each in shown]
-    np.testing.assert_allclose(true.density, 700 * np.array(factors))
-    assert nominal.friction.tolist() == [0.8] * 3
-    assert nominal.tool_friction.tolist() == [0.3] * 3
-    assert nominal.density.tolist() == [700.0] * 3
+    np.testing.assert_allclose(true.parameters["density"], 700 * np.array(factors))
+    assert nominal.parameters["friction"].tolist() == [0.8] * 3
+    assert nominal.parameters["tool_friction"].tolist() == [0.3] * 3
+    assert nominal.parameters["density"].tolist() == [700.0] * 3
     np.testing.assert_allclose(true.com[:, 0], [each.observed.com[0] for each in shown])
     assert found.keys() == {"stand_in_printed", "stand_in_everyday"}
     assert min(found.values()) > 0.1
@@ -191,9 +191,9 @@ def test_actions_that_vary_are_context_without_a_stand_in(folders, tmp_path, mon
     assert not table["metric"].str.contains("stand_in").any()
     assert table.groupby("setting")["metric"].nunique().to_dict() == {PLAIN: 6, VARIED: 6, KNOWING: 8}
     assert {context for context, _ in told} == {tuple(PARAMETERS)}
-    spreads = [np.ptp(batch.sweep) > 0.1 for _, batch in told]
+    spreads = [np.ptp(batch.parameters["sweep"]) > 0.1 for _, batch in told]
     assert spreads == [False, False, True, False]  # plain, with nominal values, varied, with nominal values
-    assert set(told[3][1].sweep) == {ToolPath.sweep}
+    assert set(told[3][1].parameters["sweep"]) == {ToolPath.sweep}
     assert list(found.summary["none"]) == ["plain test", "randomised test"]
     axis = varied.figures(table)["randomisation"].axes[0]
     assert [label.get_text() for label in axis.get_xticklabels()] == ["plain test", "randomised test"]

@@ -10,7 +10,7 @@ another one tested, a mask would tell which outline it is, so the split that cou
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -38,7 +38,7 @@ from foretrace.predictor import EffectPredictor, load_predictor
 from foretrace.predictor.config import Device
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_lengths, valid_samples
-from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.lever_up import replay
 from foretrace.trajectories import mean_distance
 
 Channel = Literal["mask", "height"]
@@ -300,12 +300,8 @@ def outcome_sensitivity(data: NonFlatData, row: int) -> dict[str, Any]:
         the two outcomes are the same).
     """
     done = data.dataset[row]
-    made = done.provenance
-    watched = data.dataset.manifest["configuration"]["simulation"]["watch_time"]
-    config = SimulationConfig(made.engine, made.embodiment, watch_time=watched, physics=done.physics)
     one, other = (
-        simulate_lever_up(done.object, done.action.moved(0.0, shift, 0.0), config).effect
-        for shift in (-NEARLY, NEARLY)
+        replay(replace(done, action=done.action.moved(0.0, shift, 0.0))).effect for shift in (-NEARLY, NEARLY)
     )
     until = min(len(e.times) if e.slip_index is None else e.slip_index for e in (one, other))
     # Each in its own action's frame: bring them into one.

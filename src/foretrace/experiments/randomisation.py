@@ -356,7 +356,7 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     told = [Physics(density=each.subject.density) if nominal else each.observed.physics for each in shown]
     values = [true_context(physics, tuple(CONTEXT)) for physics in told]
     context = {name: np.array([each[name] for each in values]) for name in CONTEXT}
-    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), **context)
+    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), parameters=context)
     imagined = predictor.imagine_batch(batch).com
     values = np.array(
         [distance_until_slip(each.observed, times, path) for each, path in zip(shown, imagined, strict=True)]
@@ -368,7 +368,8 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
 def _nominal(batch: InteractionBatch) -> InteractionBatch:
     """The same interactions with the nominal constants and action parameters."""
     values = true_context(Physics(), tuple(CONTEXT))
-    return replace(batch, **{name: np.full(len(batch), value) for name, value in values.items()})
+    constant = {name: np.full(len(batch), value) for name, value in values.items()}
+    return replace(batch, parameters=batch.parameters | constant)
 
 
 def values_of(table: pd.DataFrame, features: str, bar: str, metric: str) -> pd.Series:

@@ -352,7 +352,7 @@ def own_error(predictor: EffectPredictor, view: TopDownView, simulated: Interact
     effect = simulated.effect
     if len(effect.times) == 0:
         return np.nan
-    context = true_context(simulated.physics, predictor.context, asdict(simulated.stroke))
+    context = true_context(simulated.physics, predictor.context, simulated.action.parameters())
     imagined = predictor.imagine(view, context=context, com=effect.com_trajectory[0]).com_trajectory
     end = slice(None) if effect.slip_index is None else slice(max(1, effect.slip_index))
     return CM * warped_distance(effect.com_trajectory[end], imagined[end]).distance
