@@ -7,7 +7,7 @@ the help. How trials are run, kept and resumed is the same for all of them: `for
 import json
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, get_type_hints
@@ -122,8 +122,8 @@ class Experiment(ABC):
         """
 
     @abstractmethod
-    def run(self, trial: Any, folder: Path) -> Sequence[Row]:
-        """Carry out one trial, in whatever process.
+    def run(self, trial: Any, folder: Path) -> Iterable[Row]:
+        """Carry out one trial, in whatever process; returns its rows.
 
         Args:
             trial: The trial.
