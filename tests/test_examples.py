@@ -47,6 +47,12 @@ def test_examples_are_short_and_say_what_they_do(example: Path) -> None:
     assert text.startswith('"""')
 
 
+def test_own_experiment(tmp_path: Path) -> None:
+    printed = run_python(EXAMPLES / "own_experiment.py", tmp_path / "out")
+    assert len(re.findall(r"^\| (0.3|0.8|1.2) \| \d+\.\d\d \|$", printed, re.MULTILINE)) == 3
+    assert {"rows.csv", "summary.json", "report.md"} <= {file.name for file in (tmp_path / "out").iterdir()}
+
+
 def test_predict_a_polygon_with_a_predictor(tmp_path: Path) -> None:
     run_python("-c", SAVE_UNTRAINED, tmp_path)
     printed = run_python(EXAMPLES / "predict_a_polygon.py", tmp_path)

@@ -23,20 +23,13 @@ from foretrace.cli.card import card
 from foretrace.cli.console import say
 from foretrace.cli.data import describe, doctor, show, simulate
 from foretrace.cli.demo import demo
-from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
+from foretrace.cli.evaluation import experiment_commands
 from foretrace.cli.export import export_lerobot, export_onnx, export_rerun, export_rosbag
-from foretrace.cli.figures import figures
 from foretrace.cli.film import film
 from foretrace.cli.learning import predict, train
-from foretrace.cli.non_flat import evaluate_non_flat
 from foretrace.cli.overlay import overlay
-from foretrace.cli.randomisation import evaluate_randomisation
-from foretrace.cli.reconstruction import evaluate_reconstruction
 from foretrace.cli.recordings import import_recording
-from foretrace.cli.replay import evaluate_replay
 from foretrace.cli.robot import robot
-from foretrace.cli.transfer import evaluate_transfer
-from foretrace.cli.uncertainty import evaluate_uncertainty
 from foretrace.errors import ForetraceError
 
 Command = Callable[..., int | None]
@@ -52,25 +45,13 @@ class Group:
     """Each by its name within the group."""
 
 
+EVALUATE = "Run an experiment, or go on with it: rows, summary, report and figures."
 COMMANDS: dict[str, Command | Group] = {
     "demo": demo,
     "simulate": simulate,
     "train": train,
-    "evaluate": Group(
-        "Errors of one predictor, or the paper's comparisons of all of them.",
-        {
-            "predictor": evaluate_predictor,
-            "paper": evaluate_paper,
-            "randomisation": evaluate_randomisation,
-            "reconstruction": evaluate_reconstruction,
-            "replay": evaluate_replay,
-            "transfer": evaluate_transfer,
-            "non-flat": evaluate_non_flat,
-            "uncertainty": evaluate_uncertainty,
-        },
-    ),
+    "evaluate": Group(EVALUATE, experiment_commands()),
     "card": card,
-    "figures": figures,
     "predict": predict,
     "export": Group(
         "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot; predictors for ONNX.",
@@ -98,7 +79,7 @@ OUTPUT_CLOSED = 141
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done. 1: `doctor` has something left to mend, or trainings of `evaluate paper` failed. 2: an error, printed as
+    0: done. 1: `doctor` has something left to mend, or trials of `evaluate` failed. 2: an error, printed as
     one line. 130: interrupted. 141: the output was closed.
     """
     if threading.current_thread() is threading.main_thread():
@@ -129,8 +110,9 @@ def _run(arguments: Sequence[str]) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:
+            named = arguments[1:2] if list(arguments[:1]) == ["evaluate"] else ()
             status = tyro.cli(
-                _choice(COMMANDS),
+                _choice(COMMANDS | {"evaluate": Group(EVALUATE, experiment_commands(named))}),
                 prog="foretrace",
                 description="Predict how an object will move before the robot touches it.",
                 args=arguments,

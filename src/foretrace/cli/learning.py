@@ -179,7 +179,7 @@ def predict(
     from dataclasses import replace
 
     from foretrace.actions import ToolPath
-    from foretrace.cli.futures import outlook_of, radius_of, say_futures
+    from foretrace.cli.futures import prediction_band, radius_of, say_futures
     from foretrace.interactions.record import Physics
     from foretrace.interactions.recording_folder import write_image
     from foretrace.perception.photo import PhotoConfig, open_photo
@@ -237,7 +237,7 @@ def predict(
         scene = replace(Scene.observed(truth, paths), title=title)
     else:
         scene = Scene.imagined(obj, action, imagined.times, paths)
-    scene = replace(scene, outlook=outlook_of(imagined))
+    scene = replace(scene, band=prediction_band(imagined))
     say_futures(imagined)
     out.mkdir(parents=True, exist_ok=True)
     _write_trajectory(out, run, obj, action, imagined, truth)
