@@ -26,7 +26,9 @@ from foretrace.simulation.lever_up import SimulationConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCK = re.compile(r"(?:^<!-- (not run|needs): ([^>]+) -->\s+)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(
+    r"(?:^<!-- (not run|needs): ([^>]+) -->\s+)?^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL
+)
 LANGUAGES = {"python", "console", "bash"}
 ALL_FRAMES = animation.frames
 SHELL = re.compile(r"[$|]|&&|^(for|done)\b")
@@ -86,7 +88,9 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     training = TrainConfig(features="none", hidden=8, epochs=1, min_steps=1, split=None, threads=1)
     train_predictor(data, training, folder / "runs/im-cnn")
     (folder / "pentagon.txt").write_text(block("getting-started.md", "# pentagon.txt"), encoding="utf-8")
-    (folder / "base.json").write_text(block("robot.md", '{\n  "format": "foretrace-base-pose"'), encoding="utf-8")
+    (folder / "base.json").write_text(
+        block("robot.md", '{\n  "format": "foretrace-base-pose"'), encoding="utf-8"
+    )
     shutil.copy(ROOT / "src/foretrace/assets/racket.png", folder / "mask.png")
     trimesh.creation.box((140, 90, 20)).apply_translation((0, 0, 10)).export(folder / "part.stl")
     return folder
