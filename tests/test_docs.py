@@ -5,7 +5,6 @@ after ``<!-- not run: why -->`` is only read: its Python must compile, its ``for
 options. A block after ``<!-- needs: module -->`` runs where the module is installed.
 """
 
-import functools
 import importlib.util
 import re
 import shlex
@@ -20,7 +19,7 @@ import trimesh
 from foretrace import cli
 from foretrace.interactions.dataset import Dataset
 from foretrace.pictures import animation
-from foretrace.predictor import TrainConfig, train_predictor
+from foretrace.predictor import LstmConfig, TrainConfig, train_predictor
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
@@ -85,8 +84,8 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     collect(config, folder / "data/paper", workers=1)
     shutil.copytree(folder / "data/paper", folder / "data/small")
     data = Dataset.open(folder / "data/paper").where(outcome="levered")
-    training = TrainConfig(features="none", hidden=8, epochs=1, min_steps=1, split=None, threads=1)
-    train_predictor(data, training, folder / "runs/im-cnn")
+    training = TrainConfig(epochs=1, min_steps=1, split=None, threads=1)
+    train_predictor(data, LstmConfig(features="none", hidden=8), folder / "runs/im-cnn", training)
     (folder / "pentagon.txt").write_text(block("getting-started.md", "# pentagon.txt"), encoding="utf-8")
     (folder / "base.json").write_text(
         block("robot.md", '{\n  "format": "foretrace-base-pose"'), encoding="utf-8"
@@ -122,22 +121,11 @@ def test_snippets_run(page: Path, samples: Path, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if snippets(page)], ids=lambda page: page.name)
-def test_snippets_that_are_not_run_can_be_read(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stub(command):
-        return functools.wraps(command)(lambda *_, **__: None)
-
-    for name, command in cli.COMMANDS.items():
-        if isinstance(command, cli.Group):
-            stubs = {inner: stub(nested) for inner, nested in command.commands.items()}
-            monkeypatch.setitem(cli.COMMANDS, name, cli.Group(command.summary, stubs))
-        else:
-            monkeypatch.setitem(cli.COMMANDS, name, stub(command))
+def test_snippets_that_are_not_run_can_be_read(page: Path) -> None:
     for snippet in snippets(page):
-        if not snippet.reason:
-            continue
-        if snippet.language == "python":
+        if snippet.reason and snippet.language == "python":
             snippet.code()
-            continue
-        for program, *arguments in snippet.commands():
-            if program == "foretrace":
-                assert run(arguments) == 0, f"{snippet}: foretrace {shlex.join(arguments)}"
+        elif snippet.reason:
+            for program, *arguments in snippet.commands():
+                if program == "foretrace":
+                    cli.read(arguments)
