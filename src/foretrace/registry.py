@@ -1,6 +1,6 @@
 """Classes that register themselves by label, and those that other packages add through entry points."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
@@ -40,6 +40,11 @@ class Registry(Mapping[str, T], Generic[T]):
         self._entries[label] = entry
         return entry
 
+    def arrange(self, labels: Iterable[str]) -> None:
+        """List these labels first, in this order."""
+        first = {label: self._entries[label] for label in labels}
+        self._entries = first | self._entries
+
     def find(self, label: Any) -> T:
         """The entry of a label.
 
@@ -56,6 +61,8 @@ class Registry(Mapping[str, T], Generic[T]):
         return self._entries[label]
 
     def __contains__(self, label: object) -> bool:
+        if not isinstance(label, str):
+            return False
         if label not in self._entries:
             self._load()
         return label in self._entries
@@ -82,6 +89,11 @@ class Registry(Mapping[str, T], Generic[T]):
                 ) from reason
             if entry.name not in self._entries and not isinstance(found, type):
                 self._entries[entry.name] = found
+
+
+def adds_anything(subclass: type) -> bool:
+    """Whether a class body defines anything: one that does not, such as torch's tracer makes, stands for its parent."""
+    return any(not name.startswith("__") for name in subclass.__dict__)
 
 
 def _same_place(one: Any, other: Any) -> bool:

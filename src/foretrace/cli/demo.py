@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foretrace.cli.evaluation import print_errors
-from foretrace.cli.outlines import read_mask
+from foretrace.objects.shape_files import read_silhouette_image
 
 if TYPE_CHECKING:
     from foretrace.interactions.record import Interaction
@@ -33,13 +33,11 @@ def demo(
         workers: Processes that simulate; by default one for each core.
         seed: Seed of everything.
     """
-    from dataclasses import replace
-
     from foretrace.evaluation.metrics import evaluate_predictor
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import comparison_figure, contact_sheet
-    from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
+    from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, part_of, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
@@ -54,7 +52,7 @@ def demo(
     predictors: dict[str, EffectPredictor] = {}
     for label, name in (("none", "no feature"), ("im-cnn", "Im-CNN")):
         print(f"2. Training the LSTM with {name}")
-        run = train_predictor(dataset, replace(config, features=label), out / "runs" / label)
+        run = train_predictor(dataset, LstmConfig(features=label), out / "runs" / label, config)
         predictors[name] = load_predictor(run)
         print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
 
@@ -100,7 +98,7 @@ def _racket() -> "tuple[Interaction, TopDownView]":
     from foretrace.objects import Prism
     from foretrace.simulation.lever_up import simulate_lever_up
 
-    mask = read_mask(Path(__file__).parents[1] / "assets" / "racket.png")
+    mask = read_silhouette_image(Path(__file__).parents[1] / "assets" / "racket.png")
     racket = Prism.from_mask(mask, RACKET_SCALE, RACKET_HEIGHT)
     action = LeverUp.nearest(racket, (0.06, 0.09))
     view = TopDownView.from_mask(mask, RACKET_SCALE, action.contact, action.direction, RACKET_HEIGHT)

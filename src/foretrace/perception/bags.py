@@ -1,27 +1,28 @@
-"""Films in bags of ROS 1 and ROS 2, read without ROS (``pip install foretrace[ros]``)."""
+"""Recordings in bags of ROS 1 and ROS 2, read without ROS (``pip install foretrace[ros]``)."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from foretrace.errors import PerceptionError
-from foretrace.interactions.film_folder import Frame
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.bag_pictures import is_depth, read_colour, read_depth
+from foretrace.interactions.recording_folder import Frame
+from foretrace.perception.bag_images import is_depth, read_colour, read_depth
 
-PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TOGETHER = 0.02
-"""Depth belongs to a colour picture taken at most so much earlier or later [s]."""
+"""Largest time between a colour image and the depth that belongs to it [s]."""
 PATIENCE = 0.5
-"""So long a colour picture waits for a depth picture that comes after it [s]."""
+"""Time for which a colour image waits for a later depth image [s]."""
 
 
 class _Stream(NamedTuple):
-    """A topic with pictures."""
+    """A topic with images."""
 
     depth: bool
     """Whether they are of depth."""
@@ -62,9 +63,9 @@ def open_bag(
 
 
 def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
-    """The topics with pictures, each by its first message; those without a message are left out."""
+    """The topics with images, each by its first message; those without a message are left out."""
     found: dict[str, _Stream] = {}
-    for topic in sorted({c.topic for c in reader.connections if c.msgtype in PICTURES}):
+    for topic in sorted({c.topic for c in reader.connections if c.msgtype in IMAGES}):
         for _, _, message in _messages(reader, path, [topic]):
             found[topic] = _Stream(is_depth(message), message.header.frame_id)
             break
@@ -82,7 +83,9 @@ def _chosen(path: Path, asked: str | None, topics: list[str], kind: str, option:
     return asked
 
 
-def _reader(path: Path) -> Any:
+@contextmanager
+def _reader(path: Path) -> Iterator[Any]:
+    """An open reader of a bag."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -97,25 +100,12 @@ def _reader(path: Path) -> Any:
                 "`ros2 bag reindex`"
             )
     try:
-        return _Opened(AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)), path)
+        reader = AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
     except Exception as error:  # every kind of damage has an exception of its own there
         raise _damaged(path, error) from error
-
-
-class _Opened:
-    """A reader whose errors name the bag."""
-
-    def __init__(self, reader: Any, path: Path):
-        self._reader, self._path = reader, path
-
-    def __enter__(self) -> Any:
-        try:
-            return self._reader.__enter__()
-        except Exception as error:
-            raise _damaged(self._path, error) from error
-
-    def __exit__(self, *exception: Any) -> None:
-        self._reader.__exit__(*exception)
+    with closing(reader):
+        yield reader
 
 
 def _damaged(path: Path, error: Exception) -> PerceptionError:
@@ -164,7 +154,7 @@ def _frames(path: Path, colour: str, depth: str | None) -> Iterator[Frame]:
     def join(frame: Frame, after: tuple[float, np.ndarray] | None = None) -> Frame:
         near = [one for one in (before, after) if one is not None and abs(one[0] - frame.time) <= TOGETHER]
         nearest = min(near, key=lambda one: abs(one[0] - frame.time), default=(0.0, None))
-        return Frame(frame.time, frame.picture, nearest[1])
+        return Frame(frame.time, frame.image, nearest[1])
 
     with _reader(path) as reader:
         for topic, recorded, message in _messages(
