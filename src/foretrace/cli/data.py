@@ -81,16 +81,20 @@ def simulate(
     print(f"data set: {out}")
 
 
-def doctor(path: Positional[Path], repair: bool = False) -> int:
+def doctor(path: Positional[Path], repair: bool = False, upgrade: bool = False) -> int:
     """Check a data set: checksums, schema, numbers, ids. The exit status is 1 if something is left to mend.
 
     Args:
         path: Folder of the data set.
         repair: Remove leftovers, set corrupt shards aside (`foretrace simulate` makes them again), and enter
             whole shards that miss their checksum.
+        upgrade: Bring a data set of format version 1 to today's format first, in place.
     """
     from foretrace.interactions.doctor import examine
+    from foretrace.interactions.upgrade import upgrade as upgrade_in_place
 
+    if upgrade:
+        print(f"{path}: {upgrade_in_place(path) or 'no'} interactions upgraded")
     diagnosis = examine(path, repair)
     for finding in diagnosis.findings:
         print(f"{'repaired' if finding.repaired else 'found'}: {finding.file}: {finding.problem}")

@@ -178,7 +178,7 @@ def predict(
     """
     from dataclasses import replace
 
-    from foretrace.actions import Stroke
+    from foretrace.actions import ToolPath
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
     from foretrace.interactions.record import Physics
     from foretrace.interactions.recording_folder import write_image
@@ -229,9 +229,9 @@ def predict(
     imagined = predictor.imagine(view, context={name: told[name] for name in predictor.context}, com=com)
     paths = {predictor.display_name: imagined.com_trajectory}
     physics = Physics(**{name: told[name] for name in constants if name in told})
-    stroke = Stroke(**{name: told[name] for name in parameters if name in told})
-    simulation = SimulationConfig(physics=physics, path=stroke.path())
-    truth = simulate_lever_up(obj, action, simulation) if compare else None
+    path = ToolPath.of(**{name: told[name] for name in parameters if name in told})
+    action = replace(action, path=path)
+    truth = simulate_lever_up(obj, action, SimulationConfig(physics=physics)) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
         title = f"Predicted and simulated lever-up: {truth.effect.outcome}"
         scene = replace(Scene.observed(truth, paths), title=title)

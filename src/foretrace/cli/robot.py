@@ -51,18 +51,17 @@ def robot(
         deviation: Largest angle between a joint and its path before the motion is given up [rad].
         camera: Film the motion into the folder's film: number of a camera, or what else OpenCV opens.
     """
-    from foretrace.actions import LeverUp, ToolPath
+    from foretrace.actions import LeverUp, Screwdriver, ToolPath
     from foretrace.robot.checks import ArmLimits, check_path, refuse_unsafe
     from foretrace.robot.execution import WatchConfig
     from foretrace.robot.execution import execute as move
     from foretrace.robot.kinematics import ArmKinematics
     from foretrace.robot.path import plan_lever_up, plan_retreat, read_base_pose
     from foretrace.robot.video import VideoRecorder
-    from foretrace.simulation.tool import Tool
 
     if execute and host is None:
         raise RobotError("--execute needs --host, the controller's address")
-    watch, limits, kinematics = WatchConfig(timeout, deviation), ArmLimits(), ArmKinematics(Tool())
+    watch, limits, kinematics = WatchConfig(timeout, deviation), ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
     action, tool_path = LeverUp(contact, direction), ToolPath(clearance=clearance)
     legs = plan_lever_up(kinematics, action, T_table_base, tool_path, speed)
