@@ -105,7 +105,7 @@ class TrainConfig:
 class PredictorConfig:
     """Settings that every predictor has; a subclass beside each predictor class adds its own."""
 
-    predictor_class: ClassVar["type[EffectPredictor]"]
+    predictor_class: ClassVar[type[Any]]
     """The class that is made; set when that is defined."""
     training: ClassVar[TrainConfig] = TrainConfig()
     """Recommended settings of its training."""
