@@ -16,6 +16,18 @@ settings.register_profile(
 settings.load_profile("foretrace")
 
 
+@pytest.fixture
+def registered():
+    """Whatever a test registers is gone after it."""
+    from foretrace.features import FEATURES
+    from foretrace.predictor import PREDICTORS
+
+    before = [(registry, dict(registry._entries)) for registry in (FEATURES, PREDICTORS)]
+    yield
+    for registry, entries in before:
+        registry._entries = entries
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write the golden files anew, then look at the diff"

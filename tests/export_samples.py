@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 import factories
-from foretrace.features import make_features
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.predictor import LstmConfig, LstmPredictor, save_checkpoint
@@ -35,7 +34,7 @@ def fake_data(folder: Path, num: int = 4) -> Path:
 def fake_run(folder: Path, features: str = "none", state: str = "pose") -> Path:
     """A checkpoint of a predictor that has learned nothing."""
     torch.manual_seed(2)
-    predictor = LstmPredictor(make_features(features), NUM_SAMPLES, LstmConfig(hidden=8, state=state))
+    predictor = LstmPredictor(LstmConfig(features=features, hidden=8, state=state), NUM_SAMPLES)
     size = len(predictor.state_mean)
     predictor.set_normalisation(np.full(size, 0.1), np.full(size, 0.5), 0.05 * np.arange(NUM_SAMPLES))
     save_checkpoint(folder, predictor.eval())

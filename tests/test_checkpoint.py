@@ -1,14 +1,18 @@
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+import foretrace as ft
 from factories import fake_batch
 from foretrace.errors import CheckpointError
-from foretrace.features import FEATURES, make_features
+from foretrace.features import FEATURES
 from foretrace.predictor import LstmConfig, LstmPredictor, load_predictor, save_checkpoint
+from foretrace.predictor.checkpoint import read_config
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +23,7 @@ def batch():
 
 def make(features: str = "none", **settings) -> LstmPredictor:
     torch.manual_seed(2)
-    predictor = LstmPredictor(make_features(features), 10, LstmConfig(**({"hidden": 8} | settings)))
+    predictor = LstmPredictor(LstmConfig(**({"features": features, "hidden": 8} | settings)), 10)
     predictor.set_normalisation(
         np.full(len(predictor.state_mean), 0.1), np.full(len(predictor.state_mean), 0.5), 0.05 * np.arange(10)
     )
@@ -60,7 +64,8 @@ def test_saved_and_loaded_imagines_the_same(tmp_path, batch, features, state):
 
 
 def test_options_of_features_survive(tmp_path):
-    predictor = LstmPredictor(make_features("im-cnn", channel="height", width=7), 10, LstmConfig(hidden=8))
+    options = {"channel": "height", "width": 7}
+    predictor = LstmPredictor(LstmConfig(features="im-cnn", feature_options=options, hidden=8), 10)
     save_checkpoint(tmp_path, predictor)
     loaded = load_predictor(tmp_path)
     assert loaded.features.options == {"channel": "height", "width": 7, "dropout": 0.2}
@@ -80,7 +85,7 @@ def test_loading_leaves_the_random_numbers_alone(saved):
 @pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
 def test_missing_files_are_named(saved, name):
     (saved / name).unlink()
-    with pytest.raises(CheckpointError, match=f"{name} is missing"):
+    with pytest.raises(CheckpointError, match=f"{name} (is missing|does not exist)"):
         load_predictor(saved)
 
 
@@ -92,10 +97,10 @@ def test_damaged_files_are_named(saved, name):
         load_predictor(saved)
 
 
-@pytest.mark.parametrize("version", [0, 2, None, "1"])
+@pytest.mark.parametrize("version", [0, 3, None, "1"])
 def test_other_versions_are_refused(saved, version):
     edit_config(saved, version=version)
-    with pytest.raises(CheckpointError, match=r"format version .* reads 1"):
+    with pytest.raises(CheckpointError, match=r"format version .* reads version 2"):
         load_predictor(saved)
 
 
@@ -109,10 +114,11 @@ def test_other_formats_are_refused(saved):
     ("change", "message"),
     [
         ({"predictor": "oracle"}, "unknown predictor 'oracle'; available: lstm"),
-        ({"features": {"label": "magic", "options": {}}}, "unknown features 'magic'"),
-        ({"features": {"label": "none"}}, "incomplete"),
-        ({"settings": {"hidden": 8}}, "missing or unknown settings residual, state"),
+        ({"predictor": ["lstm"]}, "unknown predictor"),
+        ({"config": {"hidden": 8}}, "missing or unknown settings context, feature_options, features, residual"),
+        ({"config": None}, "incomplete"),
         ({"num_samples": "ten"}, "incomplete"),
+        ({"outcomes": ["melted"]}, "unknown outcome 'melted'"),
     ],
 )
 def test_odd_configurations_are_refused(saved, change, message):
@@ -138,3 +144,35 @@ def test_misshaped_tensors_are_named(saved, wrong):
     edit_tensors(saved, lambda tensors: tensors.update({"lstm.bias": wrong}))
     with pytest.raises(CheckpointError, match=r"lstm\.bias is .* asks for \(32,\) torch\.float32"):
         load_predictor(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"features": "magic"}, "unknown features 'magic'"), ({"hidden": -1}, "hidden is -1: give a number from 1")],
+)
+def test_odd_settings_are_refused(saved, change, message):
+    config = json.loads((saved / "config.json").read_text())["config"]
+    edit_config(saved, config=config | change)
+    with pytest.raises(CheckpointError, match=message):
+        load_predictor(saved)
+
+
+def test_files_of_version_1_are_read(tmp_path, batch):
+    shipped = Path(ft.__file__).parent / "predictor" / "default"
+    shutil.copy(shipped / "model.safetensors", tmp_path)
+    content = json.loads((shipped / "config.json").read_text())
+    config = content.pop("config")
+    features = {"label": config.pop("features"), "options": config.pop("feature_options")}
+    names = {"ensemble": "members", "components": "motions", "pivot_edges": "hinges"}
+    settings = {names.get(name, name): value for name, value in config.items() if name != "context"}
+    training = content["training"] | {"state": "position", "window": 15}
+    del content["outcomes"]
+    old = content | {"version": 1, "settings": settings, "features": features, "training": training}
+    (tmp_path / "config.json").write_text(json.dumps(old))
+    assert read_config(tmp_path) == read_config(shipped)
+    found, expected = (load_predictor(path).imagine_batch(batch, "estimated") for path in (tmp_path, shipped))
+    np.testing.assert_array_equal(found.com, expected.com)
+    for damaged in ({"settings": None}, {"features": {"label": "outline"}}):
+        edit_config(tmp_path, **damaged)
+        with pytest.raises(CheckpointError, match="incomplete"):
+            read_config(tmp_path)

@@ -8,11 +8,11 @@ from torch import nn
 
 from factories import fake_batch
 from foretrace.errors import PredictionError
-from foretrace.features import NoFeatures, make_features
+from foretrace.features import NoFeatures
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.topdown import TopDownView
+from foretrace.imagined import estimate_com
 from foretrace.predictor import LstmConfig, LstmPredictor
-from foretrace.predictor.base import estimate_com
 from foretrace.predictor.lstm import ProjectedLstm
 from foretrace.predictor.states import (
     Effects,
@@ -34,7 +34,7 @@ def batch():
 def make(batch, features: str = "im-cnn", **settings) -> LstmPredictor:
     torch.manual_seed(1)
     settings = {"hidden": 24} | settings
-    predictor = LstmPredictor(make_features(features), batch.com.shape[1], LstmConfig(**settings))
+    predictor = LstmPredictor(LstmConfig(features=features, **settings), batch.com.shape[1])
     states = encode_states(batch, predictor.state)
     mean, scale = state_statistics(states, valid_samples(batch), predictor.state)
     predictor.set_normalisation(mean, scale, batch.times)
@@ -168,12 +168,12 @@ def test_an_empty_mask_is_refused(batch):
         make(batch).imagine(view)
 
 
-def test_oracles_do_not_imagine_from_a_view(batch):
+def test_oracles_do_not_imagine_from_a_view(batch, registered):
     class Oracle(NoFeatures):
         label = "oracle"
         oracle = True
 
-    predictor = LstmPredictor(Oracle(), 24, LstmConfig(hidden=4))
+    predictor = LstmPredictor(LstmConfig(features="oracle", hidden=4), 24)
     with pytest.raises(PredictionError, match="'oracle'"):
         predictor.imagine(TopDownView(batch.mask[0], batch.height[0]))
     assert predictor.imagine_batch(batch).com.shape == (8, 24, 3)

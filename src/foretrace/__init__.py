@@ -14,7 +14,17 @@ if TYPE_CHECKING:
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import Bevel, Box, Cylinder, MeshObject, Prism, paper_objects, sample_prism
-    from foretrace.predictor import TrainConfig, load_predictor, train_predictor
+    from foretrace.features import FeatureExtractor
+    from foretrace.predictor import (
+        EffectPredictor,
+        LstmConfig,
+        ObservedMotion,
+        OneShotConfig,
+        PredictorConfig,
+        TrainConfig,
+        load_predictor,
+        train_predictor,
+    )
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig, simulate, simulate_lever_up
 
@@ -27,7 +37,11 @@ _HOMES = {
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
     "foretrace.objects": ("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "paper_objects", "sample_prism"),
-    "foretrace.predictor": ("TrainConfig", "load_predictor", "train_predictor"),
+    "foretrace.features": ("FeatureExtractor",),
+    "foretrace.predictor": (
+        *("EffectPredictor", "LstmConfig", "ObservedMotion", "OneShotConfig", "PredictorConfig", "TrainConfig"),
+        *("load_predictor", "train_predictor"),
+    ),
     "foretrace.simulation.collect": ("CollectConfig", "collect"),
     "foretrace.simulation.lever_up": ("SimulationConfig", "simulate", "simulate_lever_up"),
 }
@@ -40,13 +54,19 @@ __all__ = [
     "Cylinder",
     "Dataset",
     "Effect",
+    "EffectPredictor",
+    "FeatureExtractor",
     "ForetraceError",
     "Interaction",
     "InteractionBatch",
     "LeverUp",
+    "LstmConfig",
     "MeshObject",
+    "ObservedMotion",
+    "OneShotConfig",
     "Outcome",
     "Physics",
+    "PredictorConfig",
     "Prism",
     "SimulationConfig",
     "ToolPath",

@@ -1,6 +1,6 @@
 """Classes that register themselves by label, and those that other packages add through entry points."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
@@ -40,6 +40,11 @@ class Registry(Mapping[str, T], Generic[T]):
         self._entries[label] = entry
         return entry
 
+    def arrange(self, labels: Iterable[str]) -> None:
+        """List these labels first, in this order."""
+        first = {label: self._entries[label] for label in labels}
+        self._entries = first | self._entries
+
     def find(self, label: Any) -> T:
         """The entry of a label.
 
@@ -56,6 +61,8 @@ class Registry(Mapping[str, T], Generic[T]):
         return self._entries[label]
 
     def __contains__(self, label: object) -> bool:
+        if not isinstance(label, str):
+            return False
         if label not in self._entries:
             self._load()
         return label in self._entries

@@ -39,7 +39,7 @@ def demo(
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import comparison_figure, contact_sheet
-    from foretrace.predictor import TrainConfig, load_predictor, part_of, train_predictor
+    from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, part_of, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
@@ -54,7 +54,7 @@ def demo(
     predictors: dict[str, EffectPredictor] = {}
     for label, name in (("none", "no feature"), ("im-cnn", "Im-CNN")):
         print(f"2. Training the LSTM with {name}")
-        run = train_predictor(dataset, replace(config, features=label), out / "runs" / label)
+        run = train_predictor(dataset, LstmConfig(features=label), out / "runs" / label, config)
         predictors[name] = load_predictor(run)
         print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
 

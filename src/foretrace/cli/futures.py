@@ -23,7 +23,7 @@ def outlook_of(imagined: "ImaginedEffect") -> "Outlook":
     from foretrace.pictures.tubes import Outlook
 
     futures, radius = imagined.futures, radius_of(imagined)
-    if futures is None:
+    if futures.is_point:
         return Outlook()
     others = [k for k in _in_order(futures)[1:] if futures.probability[0, k] >= LEAST_PROBABLE]
     if radius is not None and radius.max() > LARGEST_RADIUS:
@@ -43,8 +43,6 @@ def _in_order(futures: "Futures") -> list[int]:
 
 def radius_of(imagined: "ImaginedEffect") -> np.ndarray | None:
     """Radius of the region about the path [m]; None where the predictor does not tell, or nobody knows."""
-    if imagined.futures is None:
-        return None
     radius = imagined.futures.radius(LEVEL)[0, _in_order(imagined.futures)[0]]
     return radius if np.isfinite(radius).all() else None
 
@@ -54,7 +52,7 @@ def say_futures(imagined: "ImaginedEffect") -> None:
     for warning in imagined.warnings:
         say(f"warning: {warning}")
     futures = imagined.futures
-    if futures is None:
+    if futures.is_point:
         return
     probable = sorted(futures.outcomes().items(), key=lambda item: -item[1][0])
     print("outcome: " + ", ".join(f"{name} {probability[0]:.1%}" for name, probability in probable))
@@ -71,7 +69,7 @@ def futures_content(imagined: "ImaginedEffect") -> dict[str, Any]:
     """The same for ``trajectory.json``; futures are in the order of their probability, null where nothing is known."""
     content: dict[str, Any] = {"warnings": list(imagined.warnings)}
     futures = imagined.futures
-    if futures is None:
+    if futures.is_point:
         return content
     radii = futures.radius(LEVEL)[0]
     content["outcomes"] = {name: float(p[0]) for name, p in futures.outcomes().items()}

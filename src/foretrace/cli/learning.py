@@ -26,16 +26,22 @@ def train(
     out: Path,
     predictor: str = "lstm",
     features: str | None = None,
-    state: Literal["position", "pose"] = "position",
-    steps_ahead: int = 1,
-    epochs: int | None = None,
-    batch_size: int = 32,
-    learning_rate: float | None = None,
-    heights: bool = False,
+    heights: bool | None = None,
+    context: tuple[str, ...] | None = None,
+    state: Literal["position", "pose", "turn"] | None = None,
+    steps_ahead: int | None = None,
     hidden: int | None = None,
-    motions: int = 32,
-    known: tuple[str, ...] = (),
-    outcomes: tuple[str, ...] = ("levered",),
+    window: int | None = None,
+    residual: bool | None = None,
+    layers: int | None = None,
+    ensemble: int | None = None,
+    components: int | None = None,
+    pivot_edges: int | None = None,
+    mirrored: bool | None = None,
+    epochs: int | None = None,
+    batch_size: int | None = None,
+    learning_rate: float | None = None,
+    outcomes: tuple[str, ...] | None = None,
     split: tuple[int, int, int] | None = None,
     seed: int = 0,
     device: Literal["auto", "cpu", "cuda"] = "auto",
@@ -49,68 +55,63 @@ def train(
     Args:
         data: Folder of the data set.
         out: Folder of the training: model, settings, metrics, split, TensorBoard events.
-        predictor: Kind of predictor: lstm, or one-shot, which needs the features outline and predicts poses.
-        features: What the predictor knows about the object; an unknown label lists the choices. By default im-cnn for
-            lstm, outline for one-shot.
-        state: Predict the centre of mass, or the whole pose.
-        steps_ahead: States predicted per iteration (n in the paper).
+        predictor: Kind of predictor: lstm, one-shot, or one that a plug-in adds.
+        features: Features of the object; an unknown label lists the choices. By default im-cnn for lstm, outline for
+            one-shot.
+        heights: Give height maps to the one-shot predictor, too, for objects that are not flat.
+        context: Conditioning variables beside the view: friction, tool_friction, density; of the action insertion,
+            arc_radius, sweep, speed.
+        state: Predict the centre of mass, or the whole pose (lstm).
+        steps_ahead: States predicted per iteration, n in the paper (lstm).
+        hidden: Units of the LSTM, by default 256; or of each layer of the one-shot predictor, by default 128.
+        window: States per training sequence (lstm).
+        residual: Predict changes of the state (lstm).
+        layers: Hidden layers (one-shot).
+        ensemble: Size of the ensemble (one-shot).
+        components: Components of the PCA basis of trajectories (one-shot).
+        pivot_edges: Candidate pivot edges, 1 or 2 (one-shot).
+        mirrored: See every lever-up in the mirror, too (one-shot).
         epochs: Passes over the training part; more where it is small, for 300 optimiser steps at least. By default 15
             for lstm, 150 for one-shot.
         batch_size: Trajectories per optimiser step.
         learning_rate: Adam's largest learning rate; it rises to it and falls to 0. By default 0.008 for lstm, 0.004 for
             one-shot.
-        heights: Let the one-shot predictor see height maps, too, for objects that are not flat.
-        hidden: Units of the LSTM, by default 256; or of each layer of the one-shot predictor, by default 128.
-        motions: Principal motions that the one-shot predictor puts trajectories together from.
-        known: What the predictor is told beside the view: friction, tool_friction, density; of the action insertion,
-            arc_radius, sweep, speed.
-        outcomes: Outcomes of the interactions to learn from.
+        outcomes: Outcomes of the interactions to learn from, by default levered.
         split: Sizes of training, validation and test part; by default the paper's 1400 100 300, or in the same
             proportion where the data set is smaller.
         seed: Seed of the split, the first weights, the order and the dropout.
         device: Where to compute.
-        threads: Threads on the CPU; more than the idle cores make it slower.
+        threads: Threads on the CPU; by default as many as are worth it.
         fresh: Discard the training in the folder instead of going on with it.
     """
-    from dataclasses import replace
+    from dataclasses import fields, replace
 
     from foretrace.interactions.dataset import Dataset
-    from foretrace.interactions.record import Outcome
     from foretrace.interactions.splits import PAPER_SIZES
-    from foretrace.predictor import RECIPES, train_predictor
+    from foretrace.predictor import PREDICTORS, train_predictor
 
-    if seed < 0:
-        raise TrainingError(f"--seed is {seed}: give a number from 0")
-    if unknown := [name for name in outcomes if name not in list(Outcome)]:
-        raise TrainingError(f"outcome {unknown[0]!r} is unknown: choose from {', '.join(Outcome)}")
-    dataset = Dataset.open(data).where(outcome=outcomes)
+    config_class = PREDICTORS.find(predictor).config_class
+    chosen: dict[str, Any] = {"features": features, "context": context, "state": state, "hidden": hidden}
+    chosen |= {"steps_ahead": steps_ahead, "window": window, "residual": residual, "layers": layers}
+    chosen |= {"ensemble": ensemble, "components": components, "pivot_edges": pivot_edges}
+    chosen |= {"mirrored": mirrored, "feature_options": None if heights is None else {"heights": heights}}
+    names = [field.name for field in fields(config_class)]
+    if "outcomes" in names:
+        chosen["outcomes"] = outcomes
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    if odd := [name for name in chosen if name not in names]:
+        raise TrainingError(
+            f"--{odd[0].replace('_', '-')} is no setting of the {predictor} predictor, which has {', '.join(names)}"
+        )
+    loop = {"epochs": epochs, "batch_size": batch_size, "learning_rate": learning_rate, "outcomes": outcomes}
+    loop = {name: value for name, value in loop.items() if value is not None}
+    config = config_class(**chosen)
+    training = replace(config.training, seed=seed, device=device, threads=threads, **loop)
+    dataset = Dataset.open(data).where(outcome=training.outcomes or ("levered",))
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
-    if predictor not in RECIPES:
-        raise TrainingError(f"unknown predictor {predictor!r}; available: {', '.join(RECIPES)}")
-    if heights and predictor != "one-shot":
-        raise TrainingError("--heights goes with --predictor one-shot: leave it out, or name that predictor")
-    chosen: dict[str, Any] = {"features": features, "epochs": epochs, "learning_rate": learning_rate}
-    chosen["hidden"] = hidden
-    if motions != 32:
-        chosen["predictor_options"] = {"motions": motions}
-    if heights:
-        chosen["feature_options"] = {"heights": True}
-    config = replace(
-        RECIPES[predictor],
-        state=state,
-        steps_ahead=steps_ahead,
-        batch_size=batch_size,
-        known=known,
-        outcomes=outcomes,
-        split=split,
-        seed=seed,
-        device=device,
-        threads=threads,
-        **{name: value for name, value in chosen.items() if value is not None},
-    )
     try:
-        train_predictor(dataset, config, out, resume=not fresh)
+        train_predictor(dataset, config, out, replace(training, split=split), resume=not fresh)
     except KeyboardInterrupt:
         say(f"interrupted; the best model so far is in {out}, the same command goes on from there")
         raise
@@ -172,7 +173,7 @@ def predict(
         shadows: Whether the object may cast shadows, which --mask background then tells from it.
         box: Left, top, width and height of a box round the object, for --mask grabcut.
         hull: Take the convex hull of the outline in the photograph, as the paper does.
-        friction: Friction coefficient between object and table, for a predictor that knows it and for --compare.
+        friction: Friction coefficient between object and table, for a predictor that is conditioned on it and for --compare.
         tool_friction: Friction coefficient between object and blade, likewise.
         density: Density of the object [kg/m^3], likewise.
         insertion: How far the blade goes under the object [m], likewise.
@@ -222,10 +223,9 @@ def predict(
         )
     constants = {"friction": friction, "tool_friction": tool_friction, "density": density}
     parameters = {"insertion": insertion, "arc_radius": arc_radius, "sweep": sweep, "speed": speed}
-    told = _told_values(constants | parameters, predictor.known, compare)
-    imagined = predictor.imagine(view, com, {name: told[name] for name in predictor.known})
-    name = f"{predictor.features.label} + LSTM" if predictor.label == "lstm" else predictor.label
-    paths = {name: imagined.com_trajectory}
+    told = _told_values(constants | parameters, predictor.context, compare)
+    imagined = predictor.imagine(view, context={name: told[name] for name in predictor.context}, com=com)
+    paths = {predictor.display_name: imagined.com_trajectory}
     physics = Physics(**{name: told[name] for name in constants if name in told})
     stroke = Stroke(**{name: told[name] for name in parameters if name in told})
     simulation = SimulationConfig(physics=physics, path=stroke.path())
@@ -253,17 +253,17 @@ def _told_values(given: dict[str, float | None], knows: tuple[str, ...], simulat
     """The constants and parameters that the command line names.
 
     Raises:
-        PredictionError: One that the predictor has to know is missing, one is not above 0, or is of no use.
+        PredictionError: One that the predictor is conditioned on is missing, is not above 0, or is of no use.
     """
     told = {name: value for name, value in given.items() if value is not None}
     for name, value in given.items():
         option = f"--{name.replace('_', '-')}"
         if value is None and name in knows:
-            raise PredictionError(f"the predictor has to know {name}: give {option}")
+            raise PredictionError(f"the predictor is conditioned on {name}: give {option}")
         if value is not None and not 0 < value < float("inf"):
             raise PredictionError(f"{option} is {value}: give a number above 0")
         if value is not None and name not in knows and not simulated:
-            raise PredictionError(f"the predictor does not know {name}: leave {option} out, or --compare")
+            raise PredictionError(f"the predictor is not conditioned on {name}: leave {option} out, or --compare")
     return told
 
 

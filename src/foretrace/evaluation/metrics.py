@@ -8,11 +8,10 @@ from torch import Tensor
 
 from foretrace.evaluation.results import Metrics
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
-from foretrace.imagined import ImaginedBatch
+from foretrace.imagined import STARTS, ImaginedBatch
+from foretrace.imagined.context import recorded_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor import EffectPredictor
-from foretrace.predictor.base import STARTS
-from foretrace.predictor.context import observed_values
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance, rotation_error
 
@@ -125,9 +124,8 @@ def measure_errors(
         ``full`` and ``final``, means over the interactions; ``full_median`` and ``final_median``. Of a predictor of
         poses also ``rotation`` and ``rotation_median`` [degrees], and ``add`` and ``add_median`` [cm].
     """
-    features = predictor.add_known(
-        predictor.compute_features(inputs), observed_values(batch, predictor.known)
-    )
+    context = recorded_context(batch, predictor.context)
+    features = predictor.add_context(predictor.compute_features(inputs), context)
     imagined = predictor.imagine_effects(features, batch.com[:, 0])
     valid = valid_samples(batch)
     truth = np.where(valid[..., None], batch.com, np.nan)

@@ -20,7 +20,7 @@ import torch
 import foretrace
 from foretrace.errors import DatasetError, ResultsError
 from foretrace.interactions.storage import sole_writer, write_atomically
-from foretrace.predictor.run_folder import flatten, git_commit
+from foretrace.predictor.run_folder import git_commit
 
 FORMAT = "foretrace-results"
 FORMAT_VERSION = 1

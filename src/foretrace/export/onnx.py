@@ -1,8 +1,7 @@
-"""A predictor's network as an ONNX file, for programs that do without PyTorch; checked against PyTorch."""
+"""A predictor's network as an ONNX file, for programs without PyTorch; checked against PyTorch."""
 
 import json
 import logging
-import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,69 +14,68 @@ import torch
 import foretrace
 from foretrace.errors import ExportError
 from foretrace.export.delivery import require
-from foretrace.export.networks import Network, network_of
+from foretrace.export.networks import draw_inputs, network_of
+from foretrace.files import atomic_path
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
 from foretrace.predictor import EffectPredictor
 from foretrace.predictor.checkpoint import describe
+from foretrace.predictor.traced import TracedPredictor
 
 LIBRARIES = ("onnx", "onnxscript", "onnxruntime")
 EXTRA = "onnx"
 OPSET = 20
 TOLERANCE = 1e-5
-"""Largest difference between what the file and PyTorch say: of positions [m], probabilities, entries of rotation
+"""Largest difference between the outputs of file and PyTorch: of positions [m], probabilities, entries of rotation
 matrices; of spreads [m] where a future is probable enough to count, and only up to ``LARGEST_SPREAD``."""
 LARGEST_SPREAD = 1.0
-"""Who is less sure than this [m] knows nothing: by how much does not matter."""
+"""Largest spread that is compared [m]: beyond it, its size does not matter."""
 BATCHES = (1, 2, 7, 32)
 """Numbers of lever-ups at once that are compared."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What has been written."""
+    """An export that has been written."""
 
     path: Path
     """The file."""
     inputs: dict[str, str]
-    """What the network reads, by name: what it is."""
+    """Meaning of each input by name."""
     outputs: dict[str, str]
-    """What it says."""
+    """Meaning of each output."""
     differences: dict[str, float] = field(default_factory=dict)
     """Largest difference from PyTorch of each output, as ``TOLERANCE`` counts it."""
 
 
 def export_onnx(predictor: EffectPredictor, out: Path, seed: int = 0) -> Exported:
-    """Write a predictor's network, and compare what the file says with what PyTorch says.
+    """Write a predictor's network, and compare the file's outputs with those of PyTorch.
 
     Args:
         predictor: The predictor.
         out: The file; it appears under its name only if the two agree.
-        seed: Of the inputs that are compared.
+        seed: Seed of the inputs that are compared.
 
     Raises:
         ExportError: A library is missing, the file exists or cannot be written, the network cannot be exported, or
-            the file says something else.
+            the file's outputs differ.
     """
     for library in LIBRARIES:
         require(library, EXTRA)
     if out.exists() or out.is_symlink():
         raise ExportError(f"{out} exists already and is not overwritten: choose another --out, or remove it")
     network = network_of(predictor)
-    draft = out.with_name(f".{out.name}.{os.getpid()}.partial")
     rng = np.random.default_rng(seed)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        _write(network, draft, rng)
-        differences = compare(network, draft, rng)
-        os.replace(draft, out)
+        with atomic_path(out) as draft:
+            _write(network, draft, rng)
+            differences = compare(network, draft, rng)
     except OSError as error:
         raise ExportError(f"cannot write {out} ({error.strerror}): choose another --out") from error
-    finally:
-        draft.unlink(missing_ok=True)
     return Exported(out, network.inputs, network.outputs, differences)
 
 
-def compare(network: Network, file: Path, rng: np.random.Generator) -> dict[str, float]:
+def compare(network: TracedPredictor, file: Path, rng: np.random.Generator) -> dict[str, float]:
     """Largest difference of each output between ONNX Runtime and PyTorch, over noise and views of prisms.
 
     Raises:
@@ -91,10 +89,10 @@ def compare(network: Network, file: Path, rng: np.random.Generator) -> dict[str,
     worst = dict.fromkeys(network.outputs, 0.0)
     for number in BATCHES:
         for noise in (False, True):
-            inputs = network.draw(rng, number, noise)
-            said = dict(zip(network.outputs, map(np.asarray, session.run(None, inputs)), strict=True))
+            inputs = draw_inputs(network, rng, number, noise)
+            found = dict(zip(network.outputs, map(np.asarray, session.run(None, inputs)), strict=True))
             for name, expected in network.imagine(inputs).items():
-                worst[name] = float(np.maximum(worst[name], _difference(name, said[name], expected)))
+                worst[name] = float(np.maximum(worst[name], _difference(name, found[name], expected)))
     for name, difference in worst.items():
         if not difference <= TOLERANCE:  # not a number is too much, too
             raise ExportError(
@@ -104,20 +102,20 @@ def compare(network: Network, file: Path, rng: np.random.Generator) -> dict[str,
     return worst
 
 
-def _difference(name: str, said: np.ndarray, expected: np.ndarray) -> float:
+def _difference(name: str, found: np.ndarray, expected: np.ndarray) -> float:
     if name == "rotation_vector":  # quaternions and axes jump at half a turn, matrices do not
-        said = quaternion_to_matrix(rotation_vector_to_quaternion(said.astype(float)))
+        found = quaternion_to_matrix(rotation_vector_to_quaternion(found.astype(float)))
     if name == "spread":  # infinite where it does not count
-        said = np.where(np.isinf(expected), np.inf, said)
-        said, expected = (np.minimum(spread, LARGEST_SPREAD) for spread in (said, expected))
-    return float(np.max(np.abs(said - expected)))
+        found = np.where(np.isinf(expected), np.inf, found)
+        found, expected = (np.minimum(spread, LARGEST_SPREAD) for spread in (found, expected))
+    return float(np.max(np.abs(found - expected)))
 
 
-def _write(network: Network, file: Path, rng: np.random.Generator) -> None:
+def _write(network: TracedPredictor, file: Path, rng: np.random.Generator) -> None:
     import onnx
 
     # A batch of one would be taken for a constant.
-    example = tuple(torch.from_numpy(values) for values in network.draw(rng, 2, noise=False).values())
+    example = tuple(torch.from_numpy(values) for values in draw_inputs(network, rng, 2, noise=False).values())
     batch = torch.export.Dim("batch")
     try:
         with _quiet(), torch.no_grad():
@@ -157,7 +155,7 @@ def _write(network: Network, file: Path, rng: np.random.Generator) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the exporter's remarks on libraries that nobody needs here."""
+    """Without the exporter's remarks on optional libraries."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

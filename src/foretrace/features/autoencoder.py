@@ -64,7 +64,7 @@ class Autoencoder(nn.Module):
         return self.decode(self.encode(images))
 
 
-class AutoencoderFeatures(FeatureExtractor):
+class AutoencoderFeatures(FeatureExtractor, abstract=True):
     """The code of an autoencoder of the masks (paper, section 3.2.2); its entries define the code's size.
 
     It learns to restore the masks of the training part, by binary cross-entropy, before the predictor is
@@ -78,6 +78,7 @@ class AutoencoderFeatures(FeatureExtractor):
         width: Channels of the first two convolutions, 128 in the paper; the third has half as many.
     """
 
+    learns = True
     code_channels: ClassVar[int]
     """Channels of the 8x8 bottleneck."""
     code_scale: Tensor

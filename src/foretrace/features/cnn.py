@@ -1,16 +1,17 @@
 """Convolutional features, trained together with the predictor (paper, section 3.3)."""
 
 from itertools import pairwise
-from typing import Literal, TypeVar
+from typing import TypeVar, get_args
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features.base import FeatureExtractor, Option
+from foretrace.errors import TrainingError
+from foretrace.features.base import FeatureExtractor, ImageName, Option, TracedFeatures
 from foretrace.features.shape_context import ShapeContext3200, shape_contexts
-from foretrace.features.windows import convolve_windows
+from foretrace.features.windows import convolve_unbranched, convolve_windows
 from foretrace.interactions.dataset import InteractionBatch
 
 CHANNELS = (32, 64, 128, 256)
@@ -57,7 +58,7 @@ class ConvolutionStack(nn.Module):
         return x
 
 
-class ConvolutionalFeatures(FeatureExtractor):
+class ConvolutionalFeatures(FeatureExtractor, abstract=True):
     """A stack of convolutions, flattened into one dense layer of rectified units with dropout.
 
     The paper leaves open what comes after the convolutions.
@@ -105,9 +106,11 @@ class ImageCnn(ConvolutionalFeatures):
 
     label = "im-cnn"
 
-    def __init__(self, channel: Literal["mask", "height"] = "mask", width: int = 128, dropout: float = 0.2):
+    def __init__(self, channel: ImageName = "mask", width: int = 128, dropout: float = 0.2):
+        if channel not in get_args(ImageName):
+            raise TrainingError(f"channel is {channel!r}: choose from {', '.join(get_args(ImageName))}")
         super().__init__(8 * 8 * CHANNELS[-1], width, dropout, channel=channel)
-        self.channel = channel
+        self.channel: ImageName = channel
 
     def inputs(self, batch: InteractionBatch) -> Shaped[Tensor, "batch 1 128 128"]:
         """The masks as bytes (0 or 1), or the height maps in units of 10 cm."""
@@ -118,6 +121,32 @@ class ImageCnn(ConvolutionalFeatures):
     def maps(self, inputs: Shaped[Tensor, "batch 1 128 128"]) -> Shaped[Tensor, "batch 256 8 8"]:
         """The maps of the window in which the object lies; nothing beside it."""
         return convolve_windows(inputs, self.stack, CHANNELS[-1])
+
+    def traced(self) -> "TracedImageCnn":
+        """All of it."""
+        return TracedImageCnn(self)
+
+
+class TracedImageCnn(TracedFeatures):
+    """``im-cnn`` as a part of an exported network, always outside training."""
+
+    def __init__(self, features: ImageCnn):
+        super().__init__()
+        self.features, self.name = features, features.channel
+        self.meaning = {
+            "mask": "view from above, 1 where the object is",
+            "height": "view from above, heights [m], 0 beside the object",
+        }[features.channel]
+        self.scale = HEIGHT_SCALE if self.name == "height" else 1.0
+
+    def inputs(self, images: Shaped[Tensor, "batch 128 128"]) -> Shaped[Tensor, "batch 1 128 128"]:
+        """As `ImageCnn.inputs`."""
+        return images[:, None] if self.name == "mask" else images[:, None] / HEIGHT_SCALE
+
+    def forward(self, images: Shaped[Tensor, "batch 128 128"]) -> Float[Tensor, "batch features"]:
+        """Every image is convolved whole and in its window, and one of the two is kept."""
+        maps = convolve_unbranched(images[:, None].float() / self.scale, self.features.stack)
+        return F.relu(self.features.dense(maps.flatten(1)))
 
 
 class ShapeContextCnn(ConvolutionalFeatures):

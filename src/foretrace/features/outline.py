@@ -5,12 +5,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from foretrace.errors import PredictionError
 from foretrace.features.base import FeatureExtractor
 from foretrace.geometry import convex_hull
+from foretrace.interactions.candidates import Candidates
 from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 
 UNIT = 0.1
 """Coordinates are divided by this to be of unit scale [m]."""
@@ -78,15 +80,45 @@ class Outline(FeatureExtractor):
         cells = rows.reshape(len(batch), HEIGHT_CELLS, HEIGHT_CELLS, side).mean(axis=3)
         return torch.cat([corners, torch.from_numpy(cells / UNIT).float().flatten(1)], dim=1)
 
+    def candidate_inputs(self, candidates: Candidates) -> Float[Tensor, "batch features"]:
+        """The same for several actions on one object, whose outline is fitted once and moved into each frame."""
+        seen = self.inputs(InteractionBatch.from_views([candidates.view]))
+        axes, origins = (torch.from_numpy(a).to(seen) for a in (candidates.axes, candidates.contacts))
+        corners = seen[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2)) - origins[:, None] / UNIT
+        moved = (corners @ axes.mT).flatten(1)
+        if not self.heights:
+            return moved
+        cells = seen[:, 2 * MAX_CORNERS :].unflatten(1, (1, HEIGHT_CELLS, HEIGHT_CELLS))
+        heights = _moved_maps(cells.expand(len(axes), -1, -1, -1), axes, origins)
+        return torch.cat([moved, heights.flatten(1)], dim=1)
+
+    def measure(self, inputs: Float[Tensor, "batch features"]) -> dict[str, Float[np.ndarray, " batch"]]:
+        """The number of corners."""
+        return {"corners": count_corners(inputs).cpu().numpy().astype(float)}
+
     def forward(self, inputs: Float[Tensor, "batch features"]) -> Float[Tensor, "batch features"]:
         """Hand them on."""
         return inputs
 
 
 def count_corners(features: Float[Tensor, "batch features"]) -> Int[Tensor, " batch"]:
-    """How many corners the hulls have that ``outline`` tells of."""
+    """Number of corners of the hulls in ``outline`` features."""
     corners = features[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2))
     return 1 + (corners[:, 1:] != corners[:, :1]).any(dim=2).sum(dim=1)
+
+
+def _moved_maps(
+    maps: Float[Tensor, "n 1 rows columns"], axes: Float[Tensor, "n 2 2"], origins: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n rows columns"]:
+    """Maps over a whole view as seen from other frames, of which the axes and origins in the view's are given [m]."""
+    # Lengths in units of half a view, positions from its middle; below, columns come first.
+    contact = (2 * maps.new_tensor(CONTACT_PIXEL) + 1) / VIEW_SIZE - 1
+    origins = contact - contact @ axes - origins / (VIEW_SIZE * METRES_PER_PIXEL / 2)
+    unmoved = F.affine_grid(torch.eye(2, 3)[None].to(maps), [1, *maps.shape[1:]], align_corners=False)
+    # All maps' places come from one product, pixels last: in long rows.
+    places = axes.mT.flip(1, 2) @ unmoved.flatten(0, 2).T + origins.flip(1)[..., None]
+    places = places.unflatten(2, maps.shape[2:]).permute(0, 2, 3, 1)
+    return F.grid_sample(maps, places, align_corners=False)[:, 0]
 
 
 def fit_hull(mask: Bool[np.ndarray, "128 128"]) -> Float[np.ndarray, "n 2"]:
@@ -172,7 +204,7 @@ def _near_hull(points: np.ndarray, nodes: np.ndarray) -> Bool[np.ndarray, " poin
     return np.abs(depth) <= HULL_MARGIN * np.linalg.norm(along, axis=1)
 
 
-def _scatter(moments: Moments) -> tuple[np.ndarray, ...]:
+def _deviations(moments: Moments) -> tuple[np.ndarray, ...]:
     """Mean x and y; sums of squared deviations xx, xy, yy."""
     n, x, y, xx, xy, yy = np.moveaxis(moments, -1, 0)
     n = np.maximum(n, 1.0)
@@ -180,14 +212,14 @@ def _scatter(moments: Moments) -> tuple[np.ndarray, ...]:
 
 
 def _squared_distance(moments: Moments) -> Float[np.ndarray, "*batch"]:
-    """Sum of squared distances of points from their line: the scatter's smaller eigenvalue."""
-    _, _, xx, xy, yy = _scatter(moments)
+    """Sum of squared distances of points from their line: their smaller eigenvalue."""
+    _, _, xx, xy, yy = _deviations(moments)
     return np.maximum((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy), 0.0)
 
 
 def _lines(moments: Moments) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
     """A point and a unit vector of the lines of least squared distance."""
-    x, y, xx, xy, yy = _scatter(moments)
+    x, y, xx, xy, yy = _deviations(moments)
     angle = np.arctan2(2 * xy, xx - yy) / 2
     return np.stack([x, y], axis=-1), np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 

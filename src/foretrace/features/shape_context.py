@@ -97,7 +97,7 @@ def shape_contexts(
     return torch.from_numpy(np.array(matrices, dtype=np.float32).reshape(len(batch), num_rings, columns))
 
 
-class ShapeContext(FeatureExtractor):
+class ShapeContext(FeatureExtractor, abstract=True):
     """The flattened shape context of the mask's outline (paper, section 3.2.1); its entries define the grid.
 
     Args:

@@ -239,6 +239,7 @@ class PredictedSupportPoints(FeatureExtractor):
     """
 
     label = "sp-pred"
+    learns = True
 
     def __init__(
         self,

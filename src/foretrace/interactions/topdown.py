@@ -37,15 +37,30 @@ class TopDownView:
     height: Float[np.ndarray, "128 128"]
     """Height of its upper surface above the table [m], 0 beside it."""
     metres_per_pixel: float = METRES_PER_PIXEL
-    """Side of a pixel [m]."""
+    """Side of a pixel [m]. Pictures of another scale, with the contact point at the same place among their pixels, are
+    resampled: a view has pixels of ``METRES_PER_PIXEL``."""
 
     def __post_init__(self) -> None:
         for name, dtype in (("mask", bool), ("height", np.float32)):
             values = np.array(getattr(self, name), dtype=dtype)
             if values.shape != (VIEW_SIZE, VIEW_SIZE):
                 raise ViewError(f"{name} of shape {values.shape}: expected ({VIEW_SIZE}, {VIEW_SIZE}) pixels")
-            values.setflags(write=False)
             object.__setattr__(self, name, values)
+        scale = self.metres_per_pixel
+        if scale != METRES_PER_PIXEL:
+            if not (np.isfinite(scale) and scale > 0):
+                raise ViewError(f"scale of {scale} m per pixel: it must be a positive length")
+            if self.mask[[0, -1]].any() or self.mask[:, [0, -1]].any():
+                raise ViewError(
+                    f"the object touches the border of a view of {scale} m per pixel, a part of it may not be seen: "
+                    "choose a larger scale or another contact point"
+                )
+            mask, height = self._resampled(_pixels_of(_pixel_centres(), scale))
+            object.__setattr__(self, "mask", mask)
+            object.__setattr__(self, "height", height)
+            object.__setattr__(self, "metres_per_pixel", METRES_PER_PIXEL)
+        for values in (self.mask, self.height):
+            values.setflags(write=False)
 
     @classmethod
     def of(cls, obj: ObjectModel, action: LeverUp) -> "TopDownView":
@@ -137,13 +152,34 @@ class TopDownView:
         height = np.where(count.reshape(VIEW_SIZE, VIEW_SIZE) == 0, closed, height)
         return cls(height > 0, height)
 
+    def seen_from(self, action: LeverUp) -> "TopDownView":
+        """The object as seen in the frame of another action; parts beyond this view stay unseen.
+
+        Args:
+            action: The action, in this view's frame.
+        """
+        centres = _pixel_centres().reshape(-1, 2)
+        return TopDownView(*self._resampled(_pixels_of(_to_object(centres, action)).reshape(VIEW_SIZE, VIEW_SIZE, 2)))
+
+    def _resampled(
+        self, pixels: Float[np.ndarray, "128 128 2"]
+    ) -> tuple[Bool[np.ndarray, "128 128"], Float[np.ndarray, "128 128"]]:
+        """Mask and height map at other places (row, column), between pixels by bilinear interpolation."""
+        rows, columns = np.moveaxis(pixels, -1, 0).astype(np.float32)
+        share, height = (
+            cv2.remap(values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            for values in (self.mask.astype(np.float32), np.where(self.mask, self.height, np.float32(0)))
+        )
+        mask = share >= 0.5
+        return mask, np.where(mask, height / np.where(mask, share, 1), 0).astype(np.float32)
+
     def to_pixels(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
         """Pixels (row, column) of points in the action frame [m]; pixel centres are whole numbers."""
-        return _pixels_of(points, self.metres_per_pixel)
+        return _pixels_of(points)
 
     def to_metres(self, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
         """Points in the action frame [m] of pixel coordinates (row, column)."""
-        return _metres_of(pixels, self.metres_per_pixel)
+        return _metres_of(pixels)
 
     def contour(self) -> Float[np.ndarray, "k 2"]:
         """Outline of the largest object in the mask, counter-clockwise in the action frame [m]."""
@@ -155,15 +191,13 @@ class TopDownView:
 
 
 def _pixels_of(
-    points: Float[np.ndarray, "k 2"], metres_per_pixel: float = METRES_PER_PIXEL
-) -> Float[np.ndarray, "k 2"]:
+    points: Float[np.ndarray, "*batch 2"], metres_per_pixel: float = METRES_PER_PIXEL
+) -> Float[np.ndarray, "*batch 2"]:
     return CONTACT_PIXEL - points / metres_per_pixel
 
 
-def _metres_of(
-    pixels: Float[np.ndarray, "*batch 2"], metres_per_pixel: float = METRES_PER_PIXEL
-) -> Float[np.ndarray, "*batch 2"]:
-    return (CONTACT_PIXEL - pixels) * metres_per_pixel
+def _metres_of(pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    return (CONTACT_PIXEL - pixels) * METRES_PER_PIXEL
 
 
 @cache

@@ -1,25 +1,28 @@
 """Predictors of an action's effect: networks, their training, their checkpoints."""
 
-from foretrace.imagined import Futures, ImaginedBatch, ImaginedEffect
-from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.checkpoint import PREDICTORS, load_predictor, save_checkpoint
+from foretrace.imagined import Futures, ImaginedBatch, ImaginedEffect, ObservedMotion
+from foretrace.predictor.base import PREDICTORS, EffectPredictor
+from foretrace.predictor.checkpoint import load_predictor, save_checkpoint
+from foretrace.predictor.config import PredictorConfig, TrainConfig
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
 from foretrace.predictor.run_folder import part_of, parts_of
-from foretrace.predictor.training import RECIPES, TrainConfig, train_predictor
+from foretrace.predictor.training import fit_predictor, train_predictor
 
 __all__ = [
     "PREDICTORS",
-    "RECIPES",
     "EffectPredictor",
     "Futures",
     "ImaginedBatch",
     "ImaginedEffect",
     "LstmConfig",
     "LstmPredictor",
+    "ObservedMotion",
     "OneShotConfig",
     "OneShotPredictor",
+    "PredictorConfig",
     "TrainConfig",
+    "fit_predictor",
     "load_predictor",
     "part_of",
     "parts_of",

@@ -1,7 +1,6 @@
 """Predictors on disk: ``config.json`` and ``model.safetensors``. Nothing is ever unpickled."""
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from importlib.resources import files
 from pathlib import Path
@@ -9,57 +8,40 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from foretrace.errors import CheckpointError, TrainingError
-from foretrace.features import make_features
-from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.domain import read_ranges
-from foretrace.predictor.files import write_json, write_tensors
-from foretrace.predictor.lstm import LstmConfig, LstmPredictor
-from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
+from foretrace.files import as_json, atomic_path, read_versioned, write_json
+from foretrace.imagined.domain import read_ranges
+from foretrace.interactions.record import Outcome
+from foretrace.predictor.base import PREDICTORS, EffectPredictor
+from foretrace.predictor.config import TrainConfig, check_outcomes
 
 FORMAT = "foretrace-predictor"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 CONFIG = "config.json"
 MODEL = "model.safetensors"
 DEFAULT = "default"
 """Folder of the predictor that comes with the package."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
-PREDICTORS: dict[str, tuple[Callable[..., EffectPredictor], type[LstmConfig] | type[OneShotConfig]]] = {
-    LstmPredictor.label: (LstmPredictor, LstmConfig),
-    OneShotPredictor.label: (OneShotPredictor, OneShotConfig),
-}
-"""Every kind of predictor by its label, with the class of its settings."""
-ADDED_SETTINGS: dict[str, Any] = {"known": (), "predictor": "lstm", "predictor_options": {}}
-"""Settings that older checkpoints and results do not name, and what they were in effect."""
-
-
-def settings_of(config: Any) -> dict[str, Any]:
-    """The settings in a dataclass by name; those that were added later only where they make a difference.
-
-    So what was written before they were added equals what would be written now.
-    """
-    return {
-        name: value
-        for name, value in asdict(config).items()
-        if name not in ADDED_SETTINGS or value != ADDED_SETTINGS[name]
-    }
+RENAMED = {"known": "context", "members": "ensemble", "motions": "components", "hinges": "pivot_edges"}
+"""Settings of version 1 by their names in version 2."""
 
 
 def describe(predictor: EffectPredictor) -> dict[str, Any]:
-    """What ``config.json`` must say for the predictor to be made again, and what it knows of its training part."""
-    ranges = {RANGES: predictor.ranges} if predictor.ranges else {}
-    return {
+    """Contents of ``config.json`` from which the predictor is made again, and facts about its training part."""
+    ranges = {RANGES: dict(predictor.ranges)} if predictor.ranges else {}
+    description = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "predictor": predictor.label,
-        "settings": settings_of(predictor.config),
-        "features": {"label": predictor.features.label, "options": predictor.features.options},
+        "config": asdict(predictor.config),
         "num_samples": predictor.num_samples,
-    } | ranges
+        "outcomes": predictor.learned_from,
+    }
+    return as_json(description | ranges)
 
 
 def save_checkpoint(
@@ -68,7 +50,7 @@ def save_checkpoint(
     """Write a predictor into a folder.
 
     Args:
-        directory: The folder; made if it is not there.
+        directory: The folder; made if it does not exist.
         predictor: The predictor.
         training: How it was trained, kept in ``config.json`` for the record.
     """
@@ -117,28 +99,43 @@ def load_predictor(path: str | Path | None = None) -> EffectPredictor:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint's ``config.json``.
+    """The contents of a checkpoint's ``config.json``, in the form of `FORMAT_VERSION`.
 
     Raises:
         CheckpointError: It is missing, damaged or of another version.
     """
     file = path / CONFIG
-    if not file.is_file():
-        raise CheckpointError(f"{file} is missing: {path} is not the folder of a trained predictor")
+    remedy = "give the folder of a trained predictor, copy it again or train anew"
+    config = read_versioned(file, FORMAT, FORMAT_VERSION, CheckpointError, remedy, key="version", older=(1,))
+    if config["version"] == FORMAT_VERSION:
+        return config
     try:
-        config = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise CheckpointError(f"{file} is not JSON ({error}): copy it again or train anew") from error
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        raise CheckpointError(
-            f"{file} does not describe a {FORMAT}: {path} is not the folder of a trained predictor"
+        return _upgrade(config)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{file} is incomplete ({error!r}): {remedy}") from error
+
+
+def _upgrade(old: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration of version 1 as one of version 2."""
+    settings = {RENAMED.get(name, name): value for name, value in old["settings"].items()}
+    features, training = old["features"], dict(old.get("training", {}))
+    loop = [*(field.name for field in fields(TrainConfig)), "data", "rows"]
+    config = {"features": features["label"], "feature_options": features["options"], "context": []} | settings
+    return {
+        **{"format": FORMAT, "version": FORMAT_VERSION, "predictor": old["predictor"], "config": config},
+        "num_samples": old["num_samples"],
+        "outcomes": training.get("outcomes", settings.get("outcomes", [str(Outcome.LEVERED)])),
+        **({RANGES: old[RANGES]} if RANGES in old else {}),
+        "training": {name: training[name] for name in loop if name in training},
+    }
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write a safetensors file atomically."""
+    with atomic_path(path) as partial:
+        save_file(
+            {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, partial, metadata
         )
-    if config.get("version") != FORMAT_VERSION:
-        raise CheckpointError(
-            f"{file} has format version {config.get('version')!r}, this foretrace reads {FORMAT_VERSION}: "
-            "use the foretrace that wrote it, or train anew"
-        )
-    return config
 
 
 def read_tensors(file: Path) -> dict[str, Tensor]:
@@ -177,23 +174,18 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -
     module.load_state_dict(dict(tensors))
 
 
-def _make(config: Mapping[str, Any], file: Path) -> EffectPredictor:
+def _make(content: Mapping[str, Any], file: Path) -> EffectPredictor:
     """The predictor that a configuration describes, untrained."""
-    if config.get("predictor") not in PREDICTORS:
-        raise CheckpointError(
-            f"{file}: unknown predictor {config.get('predictor')!r}; available: {', '.join(PREDICTORS)}"
-        )
-    kind, settings_kind = PREDICTORS[config["predictor"]]
-    known = {f.name for f in fields(settings_kind)}
     try:
-        settings, features, num_samples = config["settings"], config["features"], config["num_samples"]
-        settings = {name: value for name, value in ADDED_SETTINGS.items() if name in known} | settings
-        if odd := sorted(known ^ settings.keys()):
+        config_class = PREDICTORS.find(content["predictor"]).config_class
+        settings = content["config"]
+        if odd := sorted({field.name for field in fields(config_class)} ^ settings.keys()):
             raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
-        extractor = make_features(features["label"], **features["options"])
         tuples = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
-        predictor = kind(extractor, num_samples, settings_kind(**settings | tuples))
-        predictor.ranges = read_ranges(config.get(RANGES))
+        predictor = config_class(**settings | tuples).make(content["num_samples"])
+        check_outcomes(content["outcomes"])
+        predictor.learned_from = tuple(content["outcomes"])
+        predictor.ranges = read_ranges(content.get(RANGES))
         return predictor
     except TrainingError as error:
         raise CheckpointError(f"{file}: {error}") from error

@@ -8,20 +8,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features import FeatureExtractor, Precision
+from foretrace.features import Precision
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.states import Effects, StateKind, state_size
+from foretrace.predictor.config import PredictorConfig, check_choice, check_count
+from foretrace.predictor.states import STATE_GROUPS, Effects, StateKind, state_size
 
 CHANGE_SCALE = 0.1
 """Normalised states change by about this much in one sample: the dense layer's numbers stay of unit scale."""
 
 
-@dataclass(frozen=True)
-class LstmConfig:
+@dataclass(frozen=True, kw_only=True)
+class LstmConfig(PredictorConfig):
     """Settings of the paper's predictor."""
 
+    features: str = "im-cnn"
+    """Features of the object, by their label: what the predictor is told about it."""
     state: StateKind = "position"
-    """What is predicted: the centre of mass, or the whole pose."""
+    """What is predicted: position of the centre of mass, or the whole pose."""
     steps_ahead: int = 1
     """States predicted per iteration (n in the paper)."""
     hidden: int = 256
@@ -29,10 +32,14 @@ class LstmConfig:
     window: int = 15
     """States per training sequence. The LSTM's memory is carried from window to window, its gradient is not."""
     residual: bool = True
-    """Whether the dense layer says by how much the n next states differ from the current one, instead of the
-    states themselves as in the paper."""
-    known: tuple[str, ...] = ()
-    """Physical constants that are told beside the view."""
+    """Predict changes of the state; else states themselves, as in the paper."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("state", self.state, STATE_GROUPS)
+        check_count("steps_ahead", self.steps_ahead, 1000)
+        check_count("hidden", self.hidden, 4096)
+        check_count("window", self.window, 1_000_000)
 
 
 class ProjectedLstm(nn.Module):
@@ -185,17 +192,16 @@ class LstmPredictor(EffectPredictor):
     errors drive a roll-out off long before it has learned to make use of the features.
 
     Args:
-        features: What it knows about the object.
-        num_samples: Samples in an imagined trajectory.
         config: Settings.
+        num_samples: Samples in an imagined trajectory.
     """
 
     label = "lstm"
+    config_class = LstmConfig
+    config: LstmConfig
 
-    def __init__(self, features: FeatureExtractor, num_samples: int, config: LstmConfig | None = None):
-        config = config or LstmConfig()
-        super().__init__(features, config.state, num_samples, config.known)
-        self._config = config
+    def __init__(self, config: LstmConfig, num_samples: int):
+        super().__init__(config, num_samples, config.state)
         size = state_size(config.state)
         self.lstm = ProjectedLstm(size, self.num_inputs, config.hidden)
         self.output = nn.Linear(config.hidden, config.steps_ahead * size)
@@ -203,9 +209,9 @@ class LstmPredictor(EffectPredictor):
         nn.init.zeros_(self.output.bias)
 
     @property
-    def config(self) -> LstmConfig:
-        """Settings."""
-        return self._config
+    def display_name(self) -> str:
+        """Name in figures and tables."""
+        return f"{self.features.label} + LSTM"
 
     @property
     def feature_weights(self) -> list[nn.Parameter]:
@@ -225,10 +231,10 @@ class LstmPredictor(EffectPredictor):
         """
         states, lengths = effects.states, effects.lengths
         time = states.shape[1]
-        ahead = self._config.steps_ahead
+        ahead = self.config.steps_ahead
         projected = self.lstm.project(features)
         memory, outputs = None, []
-        for window in states[:, :-1].split(self._config.window, dim=1):
+        for window in states[:, :-1].split(self.config.window, dim=1):
             output, memory = self.lstm(window, projected, memory)
             outputs.append(output)
         predicted = self._next_states(torch.cat(outputs, dim=1), states[:, :-1])
@@ -257,5 +263,5 @@ class LstmPredictor(EffectPredictor):
         self, outputs: Float[Tensor, "*batch hidden"], current: Float[Tensor, "*batch state"]
     ) -> Float[Tensor, "*batch ahead state"]:
         """The n states after the current ones, from the LSTM's outputs there."""
-        said = self.output(outputs).unflatten(-1, (self._config.steps_ahead, -1))
-        return current[..., None, :] + CHANGE_SCALE * said if self._config.residual else said
+        predicted = self.output(outputs).unflatten(-1, (self.config.steps_ahead, -1))
+        return current[..., None, :] + CHANGE_SCALE * predicted if self.config.residual else predicted

@@ -1,4 +1,4 @@
-"""The distribution over motions that the networks of the direct predictor describe."""
+"""The distribution over motions that the networks of the direct trajectory predictor parametrise."""
 
 from dataclasses import dataclass
 
@@ -8,39 +8,39 @@ from torch import Tensor
 from torch.nn import functional as F
 
 COORDINATES = 6
-"""A motion's numbers per sample: displacement of the centre of mass, rotation vector, along a hinge's axes [m]."""
+"""Numbers of a motion per sample: displacement of the centre of mass, rotation vector, along an edge's axes [m]."""
 TURN_LENGTH = 0.05
-"""A turn by 1 rad weighs as much as a displacement by this [m]: about the distance from hinge to centre of mass."""
+"""Displacement that weighs as much as a turn by 1 rad [m]: about the distance from edge to centre of mass."""
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Gaussian distributions of the weights of principal motions, one for each hinge and outcome."""
+    """Gaussian distributions of weights in a PCA basis of trajectories, one for each pivot edge and outcome."""
 
     com: Float[Tensor, "batch 3"]
     """Centres of mass at rest in the action frame [m]."""
-    axes: Float[Tensor, "batch hinges 3 3"]
-    """Rows: the hinges' axes in the action frame."""
-    ends: Float[Tensor, "batch hinges 2 2"]
-    """Ends of the hinges [m]."""
-    odds: Float[Tensor, "batch hinges outcomes"]
-    """Logarithms of probabilities."""
-    mean: Float[Tensor, "batch hinges outcomes motions"]
+    axes: Float[Tensor, "batch edges 3 3"]
+    """Rows: the edges' axes in the action frame."""
+    ends: Float[Tensor, "batch edges 2 2"]
+    """Ends of the edges [m]."""
+    log_probability: Float[Tensor, "batch edges outcomes"]
+    """Logarithms of the futures' probabilities."""
+    mean: Float[Tensor, "batch edges outcomes components"]
     """Expected weights."""
-    error: Float[Tensor, "batch hinges outcomes"]
-    """How large errors are expected to be."""
-    covariance: Float[Tensor, "outcomes motions motions"]
-    """Of weights, for errors of 1."""
-    motions: Float[Tensor, "motions time 6"]
-    """Principal motions along a hinge's axes [m]; turns times ``TURN_LENGTH``."""
+    error: Float[Tensor, "batch edges outcomes"]
+    """Predicted scale of the error."""
+    covariance: Float[Tensor, "outcomes components components"]
+    """Covariance of the weights at an error scale of 1."""
+    components: Float[Tensor, "components time 6"]
+    """PCA basis of trajectories along an edge's axes [m]; turns times ``TURN_LENGTH``."""
     mean_motion: Float[Tensor, "time 6"]
-    """What they are added to."""
+    """Mean trajectory, which they are added to."""
 
     def most_probable(self) -> Float[Tensor, "batch time 6"]:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
         rows = torch.arange(len(self.com), device=self.com.device)
-        best = self.odds.flatten(1).argmax(dim=1)
-        weights, axes = self.mean.flatten(1, 2)[rows, best], self.axes[rows, best // self.odds.shape[2]]
+        best = self.log_probability.flatten(1).argmax(dim=1)
+        weights, axes = self.mean.flatten(1, 2)[rows, best], self.axes[rows, best // self.log_probability.shape[2]]
         return self._states(weights[:, None, None], axes[:, None])[:, 0]
 
     def states(self) -> Float[Tensor, "batch futures time 6"]:
@@ -50,27 +50,27 @@ class Mixture:
     def sample(self, num: int, generator: torch.Generator | None = None) -> Float[Tensor, "batch num time 6"]:
         """Positions [m] and rotation vectors [rad] drawn at random."""
         rows = torch.arange(len(self.com), device=self.com.device)[:, None]
-        chosen = torch.multinomial(self.odds.flatten(1).exp(), num, replacement=True, generator=generator)
+        chosen = torch.multinomial(self.log_probability.flatten(1).exp(), num, replacement=True, generator=generator)
         z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
         root, error = torch.linalg.cholesky(self.covariance), self.error.flatten(1)[rows, chosen]
         off = error[..., None] * (root[chosen % len(root)] @ z[..., None])[..., 0]
         weights = self.mean.flatten(1, 2)[rows, chosen] + off
-        return self._states(weights[:, :, None], self.axes[rows, chosen // self.odds.shape[2]])
+        return self._states(weights[:, :, None], self.axes[rows, chosen // self.log_probability.shape[2]])
 
     def spread(self) -> Float[Tensor, "batch futures time"]:
         """Root mean square of the distance from each future's positions [m]."""
-        displaced = self.motions[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, motions)
+        displaced = self.components[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, components)
         variance = ((displaced @ self.covariance) * displaced).sum(dim=-1)
         at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()  # (outcomes, time)
         return (self.error[..., None] * at_error_1).flatten(1, 2)
 
     def _states(
         self,
-        weights: Float[Tensor, "batch hinges futures motions"],
-        axes: Float[Tensor, "batch hinges 3 3"],
-    ) -> Float[Tensor, "batch hinges*futures time 6"]:
+        weights: Float[Tensor, "batch edges futures components"],
+        axes: Float[Tensor, "batch edges 3 3"],
+    ) -> Float[Tensor, "batch edges*futures time 6"]:
         shape = (*weights.shape[:3], 2, 3)  # displacements and turns
-        motion = torch.addmm(self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.motions.mT.flatten(1))
+        motion = torch.addmm(self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.components.mT.flatten(1))
         back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)
         rest = F.pad(self.com, (0, 3)).unflatten(1, (2, 3))[:, None, None].expand(shape)
         # One product with time last: memory is gone through once, in long rows.
@@ -80,10 +80,10 @@ class Mixture:
         return states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
 
 
-def along_hinges(
-    axes: Float[Tensor, "batch *hinges 3 3"], motion: Float[Tensor, "batch time 6"]
-) -> Float[Tensor, "batch *hinges time 6"]:
-    """Displacements and turns in the action frame along hinges' axes.
+def along_edges(
+    axes: Float[Tensor, "batch *edges 3 3"], motion: Float[Tensor, "batch time 6"]
+) -> Float[Tensor, "batch *edges time 6"]:
+    """Displacements and turns in the action frame along edges' axes.
 
     A turn seen along left-handed axes, those of a mirror image, goes the other way round.
     """

@@ -1,35 +1,33 @@
-"""What somebody who is handed a predictor has to know of it: a page in Markdown, made from its run and its data."""
+"""Model card of a predictor: a page in Markdown, made from its run and its data."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from foretrace.errors import TrainingError
-from foretrace.imagined import LEVELS, conformal_scores
+from foretrace.files import flatten, read_json
+from foretrace.imagined import LEVELS, STARTS, conformal_scores
+from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
-from foretrace.predictor import EffectPredictor, load_predictor, part_of
-from foretrace.predictor.base import STARTS
+from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
 from foretrace.predictor.checkpoint import read_config
-from foretrace.predictor.domain import MEASURES, QUANTILES
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
 
 PARTS = ("train", "validation", "test")
 SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
-"""Levels of the regions that the card tells of."""
+"""Levels of the regions on the card."""
 CM = 100.0
-OPTIONS = (
-    *("features", "state", "steps_ahead", "hidden", "epochs", "batch_size", "learning_rate"),
-    *("known", "outcomes", "split", "seed"),
-)
-"""Settings that are options of ``foretrace train``."""
+RUNTIME_OPTIONS = ("min_steps", "device", "precision", "threads")
+"""Settings of a training that the card's command leaves at their defaults."""
 LIMITS = """\
-- It knows one action, the lever-up, with the tool path of its data, and rigid objects that lie alone on a flat table.
+- It imagines one action, the lever-up, with the tool path of its data, and rigid objects that lie alone on a flat table.
 - It has learned from simulation. How far a real object is from it is not part of this card.
 - Probabilities and regions hold for lever-ups like those in the data: an object that is unlike them is pointed out, an
   unlike friction, density, rim or tool is not.
@@ -45,7 +43,7 @@ def model_card(run: Path, data: Path) -> str:
 
     Raises:
         CheckpointError: There is no finished predictor.
-        TrainingError: The data set is another one, or the folder does not tell what the training ran on.
+        TrainingError: The data set is another one, or the folder lacks a part of the training.
     """
     predictor, dataset = load_predictor(run), Dataset.open(data)
     parts = {part: part_of(run, dataset, part) for part in PARTS}
@@ -68,20 +66,19 @@ def model_card(run: Path, data: Path) -> str:
 
 def _about(predictor: EffectPredictor) -> str:
     times = predictor.times.tolist()
-    known = f", is told {', '.join(predictor.known)}" if predictor.known else ""
-    outcomes = f", tells apart {', '.join(predictor.outcomes)}" if predictor.outcomes else ""
-    told = "the centre of mass" if predictor.state == "position" else "the pose"
+    context = f", is conditioned on {', '.join(predictor.context)}" if predictor.context else ""
+    outcomes = f", distinguishes {', '.join(predictor.outcomes)}" if predictor.outcomes else ""
+    imagined = "the centre of mass" if predictor.state == "position" else "the pose"
     return (
-        f"Imagines {told} of a levered object from the view from above: {len(times)} samples in {times[-1]:.2f} s, in "
-        f"the action frame, SI units{known}{outcomes}. {sum(p.numel() for p in predictor.parameters())} weights."
+        f"Imagines {imagined} of a levered object from the view from above: {len(times)} samples in {times[-1]:.2f} s, in "
+        f"the action frame, SI units{context}{outcomes}. {sum(p.numel() for p in predictor.parameters())} weights."
     )
 
 
 def _data(
     dataset: Dataset, data: Path, parts: Mapping[str, InteractionBatch], families: Mapping[int, str]
 ) -> str:
-    settings = dict(_flat(dataset.manifest["configuration"]))
-    told = ", ".join(f"{name} {value}" for name, value in settings.items())
+    chosen = ", ".join(_settings(dataset.manifest["configuration"]))
     rows = []
     for outcome in sorted({str(name) for batch in parts.values() for name in batch.outcome}):
         for family in sorted(set(families.values())):
@@ -89,27 +86,25 @@ def _data(
             if any(counts):
                 rows.append([outcome, family, *map(str, counts)])
     rows.append(["all", "", *(str(len(batch)) for batch in parts.values())])
-    return f"`{data.name}`, simulated with: {told}.\n\n" + _table(["Outcome", "Objects", *PARTS], rows)
+    return f"`{data.name}`, simulated with: {chosen}.\n\n" + _table(["Outcome", "Objects", *PARTS], rows)
 
 
 def _training(run: Path, data: Path) -> str:
-    training = read_config(run)["training"]
-    command = [f"foretrace train --data {data} --out {run} --predictor {training.get('predictor', 'lstm')}"]
-    for name in OPTIONS:
-        value = training.get(name)
-        if value is None or value == [] or value == ():
+    content = read_config(run)
+    training, config = content["training"], flatten({"feature_options": {}} | content["config"])
+    command = [f"foretrace train --data {data} --out {run} --predictor {content['predictor']}"]
+    options = {name.removeprefix("feature_options."): value for name, value in config.items()}
+    options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
+    for name, value in options.items():
+        option = name.replace("_", "-")
+        if name in RUNTIME_OPTIONS or value is None or value == [] or value == {}:
             continue
-        said = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-        command.append(f"--{name.replace('_', '-')} {said}")
-    command += [f"--{name} {value}" for name, value in training.get("predictor_options", {}).items()]
-    if training.get("feature_options", {}).get("heights"):
-        command.append("--heights")
-    try:
-        environment = json.loads((run / ENVIRONMENT).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise TrainingError(
-            f"{run / ENVIRONMENT} cannot be read: give the whole folder of a training"
-        ) from error
+        if isinstance(value, bool):
+            command.append(f"--{'' if value else 'no-'}{option}")
+        else:
+            values = value if isinstance(value, list) else [value]
+            command.append(f"--{option} {' '.join(map(str, values))}")
+    environment = read_json(run / ENVIRONMENT, TrainingError, "give the whole folder of a training")
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return (
         f"```console\n$ {' '.join(command)}\n```\n\nCommit {environment['commit'] or 'unknown'}; {versions}; on "
@@ -140,17 +135,16 @@ def _errors(predictor: EffectPredictor, test: InteractionBatch, families: Mappin
     until = "the whole record" if predictor.outcomes else "the record up to where the object slipped"
     return (
         f"Distance of the imagined centre of mass from where it was [cm], over {until} and at its end. `observed`: the "
-        f"first centre of mass was given; `estimated`: it was judged from the view.\n\n{_table(head, rows)}"
+        f"first centre of mass was given; `estimated`: it was estimated from the view.\n\n{_table(head, rows)}"
     )
 
 
 def _calibration(predictor: EffectPredictor, test: InteractionBatch) -> str:
-    imagined = predictor.imagine_batch(test)
-    futures = imagined.futures
-    if futures is None:
+    futures = predictor.imagine_batch(test).futures
+    if futures.is_point:
         return ""
     names = list(futures.outcomes())
-    said = np.array(names)[np.argmax(list(futures.outcomes().values()), axis=0)]
+    expected = np.array(names)[np.argmax(list(futures.outcomes().values()), axis=0)]
     common = max(float(np.mean(test.outcome == name)) for name in names)
     lengths = predictor.lengths(test)
     scores = conformal_scores(futures, test.com, lengths)
@@ -160,10 +154,10 @@ def _calibration(predictor: EffectPredictor, test: InteractionBatch) -> str:
         radius = futures.radius(level)[np.arange(len(test)), futures.probability.argmax(axis=1)]
         end = CM * float(np.median(radius[np.arange(len(test)), lengths - 1]))
         rows.append([f"{level:.0%}", f"{held.mean():.1%}", f"{end:.2f}" if np.isfinite(end) else "unknown"])
-    right = np.mean(said == test.outcome)
+    right = np.mean(expected == test.outcome)
     return (
         f"The most probable outcome is what happened in {right:.1%} of {len(test)} interactions; "
-        f"always saying the most common one is right in {common:.1%}. A region holds whole motions.\n\n"
+        f"the most common outcome occurs in {common:.1%}. A region holds whole motions.\n\n"
         + _table(["Region", "Held", "Median radius at the end [cm]"], rows)
     )
 
@@ -203,7 +197,7 @@ def _mask(batch: InteractionBatch, families: Mapping[int, str], outcome: str, fa
 
 
 def _groups(batch: InteractionBatch, families: Mapping[int, str]) -> Iterator[tuple[str, np.ndarray]]:
-    """All, those of each outcome, those of each family: name and members."""
+    """Name and rows of each group: all, those of each outcome, those of each family."""
     yield "all", np.ones(len(batch), dtype=bool)
     for name in np.unique(batch.outcome):
         yield str(name), batch.outcome == name
@@ -216,13 +210,12 @@ def _p95(values: np.ndarray) -> float:
     return float(np.nanpercentile(values, 95))
 
 
-def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Settings without the tool's and its path's, which every data set has."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from () if name in ("path", "tool") else _flat(value)
-        elif value is not None:
-            yield name.replace("_", " "), value
+def _settings(configuration: Mapping[str, Any]) -> Iterator[str]:
+    """Settings without those of the tool and its path, which every data set has."""
+    for name, value in flatten(configuration).items():
+        *parents, own = name.split(".")
+        if value is not None and not {"path", "tool"} & set(parents):
+            yield f"{own.replace('_', ' ')} {value}"
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

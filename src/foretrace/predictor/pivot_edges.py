@@ -1,8 +1,8 @@
-"""The edges that an object may turn about, and the lever-up as seen from there.
+"""Candidate pivot edges of an object, and lever-ups described relative to them.
 
-A lifted object turns about an edge of its footprint, nearly as on a hinge. Seen from there, lever-ups of different
-objects look alike: what matters is how far contact and centre of mass are from the hinge, and which way the blade
-pushes. All of it is in closed form from the hull's corners and the centre of mass.
+A lifted object turns about an edge of its footprint, nearly as on a hinge. Relative to that edge, lever-ups of different
+objects look alike: what matters is how far contact and centre of mass are from it, and which way the blade pushes. All
+of it is in closed form from the hull's corners and the centre of mass.
 """
 
 from dataclasses import dataclass
@@ -19,51 +19,51 @@ from foretrace.objects import BEVEL
 UNIT = 0.1
 """Lengths are divided by this to be of unit scale [m]."""
 NEAR_CORNER = 0.01
-"""Where the ray leaves the hull is told in more detail this near to a corner [m]."""
+"""Distance from a corner within which the place where the ray leaves the hull is described in more detail [m]."""
 AT_CORNER = 0.003
-"""Where rays leave the bottom face is told in more detail this near to a corner [m]."""
+"""The same for the places where rays leave the bottom face [m]."""
 RIM = BEVEL.width
-"""Objects stand on a bottom face that lies so far inside the outline [m]."""
+"""Distance of the bottom face, on which objects stand, from the outline [m]."""
 SHARPEST = 2.6
-"""Corners that turn by more are taken to turn by this [rad]: those of the bottom face would be far away."""
+"""Largest turn of the outline at a corner [rad]: the bottom face's corner would be far away at sharper ones."""
 OUT_OF_SIGHT = 0.15
 """Positions along an edge are cut off this far from it [m]."""
 NUM_VALUES = 27
-"""Numbers that describe a lever-up as seen from one hinge."""
+"""Numbers that describe a lever-up relative to one edge."""
 PROBES = 5
-"""Heights are read at this many places along either side of the rectangle about the hull."""
+"""Places along either side of the rectangle about the hull at which heights are read."""
 MIRROR = (1.0, -1.0, 1.0)
 """A vector seen in a mirror along the action axis."""
 IN_MIRROR = [0, 1, 2, 4, 3, 5, 7, 6, 8, 9, 11, 10, 13, 12, 15, 14, 16, 17, 19, 18, 21, 20, 23, 22, 25, 24, 26]
-"""Which of the numbers that describe a lever-up each of them is in the mirror, but for its sign."""
+"""Index that each of the numbers has in the mirror image, which may change its sign."""
 SIGN_IN_MIRROR = torch.ones(NUM_VALUES)
-"""Its sign: positions along the hinge are counted the other way."""
+"""That sign: positions along the edge are counted the other way."""
 SIGN_IN_MIRROR[[2, 3, 4, 5, 8, 10, 11, 17, 26]] = -1
 
 
 @dataclass(frozen=True)
-class Hinges:
-    """The edges that objects may turn about, each a frame of its own; and those of their mirror images.
+class PivotEdges:
+    """Edges that objects may turn about, each with a frame of its own; and those of their mirror images.
 
     The axes of that frame: out of the object, along the edge counter-clockwise, up. An object that turns outwards
     over the edge turns about the second axis by a positive angle. The second view is that of a mirror along the
     action axis; its axes are mirrored back, so they are left-handed.
     """
 
-    values: Float[Tensor, "batch views hinges values"]
-    """The lever-up as seen from there, of unit scale."""
-    axes: Float[Tensor, "batch views hinges 3 3"]
+    values: Float[Tensor, "batch views edges values"]
+    """The lever-up relative to them, of unit scale."""
+    axes: Float[Tensor, "batch views edges 3 3"]
     """Rows: the axes in the action frame."""
-    ends: Float[Tensor, "batch hinges 2 2"]
+    ends: Float[Tensor, "batch edges 2 2"]
     """Ends of the edges in the action frame [m], the right one first as seen from inside."""
 
 
-def find_hinges(
+def find_pivot_edges(
     corners: Float[Tensor, "batch corners 2"],
     com: Float[Tensor, "batch 3"],
-    num_hinges: int = 2,
+    num_edges: int = 2,
     heights: Float[Tensor, "batch rows columns"] | None = None,
-) -> Hinges:
+) -> PivotEdges:
     """The edges crossed by the rays from lift point through centre of mass, and their neighbours there.
 
     The first is the edge of `foretrace.features.support_points.support_points_by_rule`, the second the one beyond
@@ -72,30 +72,30 @@ def find_hinges(
     Args:
         corners: Corners of convex hulls in the action frame [m], counter-clockwise; the first one fills the row.
         com: Centres of mass at rest in the action frame [m].
-        num_hinges: 1 or 2.
+        num_edges: 1 or 2.
         heights: Height maps over the whole view [m], of any resolution. They add ``PROBES`` squared values.
     """
     lift = torch.stack([torch.full_like(com[:, 1], -SETBACK), HALF_WIDTH * com[:, 1].sign()], dim=1)
     ray = F.normalize(com[:, :2] - lift, dim=1)
     hull = _Hull(corners)
-    values, axes, ends = _see(hull, hull.crossed(lift, ray, num_hinges), com, lift, ray)
+    values, axes, ends = _describe(hull, hull.crossed(lift, ray, num_edges), com, lift, ray)
     values = torch.stack([values, values[..., IN_MIRROR] * SIGN_IN_MIRROR.to(values)], dim=1)
     if heights is not None:
         probed = _probe(heights, corners, axes)
         values = torch.cat([values, torch.stack([probed, probed.flip(-1)], dim=1).flatten(3)], dim=-1)
-    # What goes out of the object or up does so in the mirror, too; along the edge it is the other way round.
-    return Hinges(values, torch.stack([axes, axes * axes.new_tensor(MIRROR)[:, None]], dim=1), ends)
+    # A vector out of the object or up stays so in the mirror; along the edge it is reversed.
+    return PivotEdges(values, torch.stack([axes, axes * axes.new_tensor(MIRROR)[:, None]], dim=1), ends)
 
 
 def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "batch corners 2"]:
-    """The hulls of `find_hinges` seen in a mirror along the action axis, counter-clockwise again."""
+    """The hulls of `find_pivot_edges` seen in a mirror along the action axis, counter-clockwise again."""
     number, count = torch.arange(corners.shape[1], device=corners.device), _Hull(corners).count[:, None]
     order = torch.where(number < count, -number % count, 0)
     return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor(MIRROR[:2])
 
 
 class _Hull:
-    """Edges of convex hulls, of which each object has another number."""
+    """Edges of convex hulls, whose number differs between objects."""
 
     def __init__(self, corners: Float[Tensor, "batch corners 2"]):
         self.start = corners
@@ -148,10 +148,10 @@ class _Hull:
         return first, first + length
 
 
-def _see(
-    hull: _Hull, edges: Int[Tensor, "batch hinges"], com: Tensor, lift: Tensor, ray: Tensor
+def _describe(
+    hull: _Hull, edges: Int[Tensor, "batch edges"], com: Tensor, lift: Tensor, ray: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The lever-ups as seen from edges. Along them, positions count from the contact point."""
+    """Lever-ups relative to edges. Along them, positions count from the contact point."""
     start, along, length = hull.edges(edges)
     along_before, along_after = (hull.edges(edges + by)[1] for by in (-1, 1))
     out = torch.stack([along[..., 1], -along[..., 0]], dim=-1)
@@ -161,7 +161,7 @@ def _see(
         return (normal * point).sum(dim=-1)
 
     def crossing(lift: Tensor, ray: Tensor, inside: float) -> Tensor:
-        """Where a ray leaves, along the hinge, if that is moved inwards."""
+        """Where a ray crosses an edge that is moved inwards, along the edge."""
         travel = (ahead(out, start) - inside - ahead(out, lift)) / ahead(out, ray).clamp(min=0.02)
         place = ahead(along, lift) + travel * ahead(along, ray)
         return place.maximum(first - OUT_OF_SIGHT).minimum(last + OUT_OF_SIGHT)
@@ -169,7 +169,7 @@ def _see(
     first, beside = ahead(along, start), ahead(along, mass)
     last = first + length
     leaves = crossing(lift, ray, 0.0)
-    # How sharply the hull turns at the hinge's ends: at a blunt corner, its neighbour is nearly the same hinge.
+    # How sharply the hull turns at the edge's ends: beyond a blunt corner, the neighbour is nearly the same edge.
     turns = [_turn(along_before, along), _turn(along, along_after)]
     right, left = (RIM * torch.tan(turn / 2) for turn in turns)
     other = lift * lift.new_tensor(MIRROR[:2])
@@ -177,9 +177,9 @@ def _see(
     below = [crossing(lift, ray, RIM), crossing(other, F.normalize(mass - other, dim=-1), RIM)]
     apart = [gap for place in below for gap in (place - first - right, last - left - place)]
     lengths = [
-        # From contact, and from centre of mass, to the hinge; the centre of mass and the ends along it.
+        # From contact, and from centre of mass, to the edge; the centre of mass and the ends along it.
         *(ahead(out, start), ahead(out, start - mass), beside, first, last),
-        # Where the ray leaves: along the hinge, from its ends, from the centre of mass.
+        # Where the ray leaves: along the edge, from its ends, from the centre of mass.
         *(leaves, leaves - first, last - leaves, leaves - beside),
         com[:, 2:].expand_as(length),
         # The edge that the blade goes under.
@@ -212,11 +212,11 @@ def _see(
 def _probe(
     heights: Float[Tensor, "batch rows columns"],
     corners: Float[Tensor, "batch corners 2"],
-    axes: Float[Tensor, "batch hinges 3 3"],
-) -> Float[Tensor, "batch hinges out along"]:
-    """Heights on a grid over the rectangle about the hull with sides along the hinge, of unit scale."""
+    axes: Float[Tensor, "batch edges 3 3"],
+) -> Float[Tensor, "batch edges out along"]:
+    """Heights on a grid over the rectangle about the hull with sides along the edge, of unit scale."""
     sides = axes[..., :2, :2]  # rows: out of the object, along the edge
-    reach = corners[:, None] @ sides.mT  # (batch, hinges, corners, 2)
+    reach = corners[:, None] @ sides.mT  # (batch, edges, corners, 2)
     low, high = reach.amin(dim=-2), reach.amax(dim=-2)
     share = (torch.arange(PROBES, dtype=low.dtype, device=low.device) + 0.5) / PROBES
     grid = torch.stack(torch.meshgrid(share, share, indexing="ij"), dim=-1).flatten(0, 1)

@@ -1,8 +1,6 @@
-"""The folder of one training: configuration, surroundings, progress, the best model so far."""
+"""The folder of one training: configuration, environment, progress, the best model so far."""
 
 import csv
-import hashlib
-import importlib.metadata
 import io
 import json
 import platform
@@ -18,6 +16,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from foretrace.errors import DatasetError, TrainingError
+from foretrace.files import as_json, first_difference, read_json, short_hash, versions_of, write_json, write_text
+from foretrace.imagined.context import column_of
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
@@ -29,8 +29,8 @@ from foretrace.predictor.checkpoint import (
     load_tensors,
     read_config,
     read_tensors,
+    write_tensors,
 )
-from foretrace.predictor.files import write_json, write_tensors, write_text
 
 ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
@@ -44,7 +44,7 @@ Row = dict[str, int | float]
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a training has come."""
+    """Progress of a training."""
 
     history: list[Row] = field(default_factory=list)
     """One row of metrics per finished epoch."""
@@ -95,7 +95,7 @@ class RunFolder:
         Raises:
             TrainingError: The folder holds a training of another configuration, or something else.
         """
-        config = json.loads(json.dumps(describe(predictor) | {"training": training}))
+        config = as_json(describe(predictor) | {"training": training})
         if resume and (self.path / CONFIG).is_file():
             self._check(config)
             return
@@ -110,17 +110,26 @@ class RunFolder:
 
     def _check(self, config: Mapping[str, Any]) -> None:
         there = {name: value for name, value in read_config(self.path).items() if name != RANGES}
-        found, wanted = flatten(there), flatten(config)
-        for name in sorted(found.keys() | wanted.keys()):
-            if found.get(name) != wanted.get(name):
-                raise TrainingError(
-                    f"{self.path} holds a training with {name} = {found.get(name)!r}, not "
-                    f"{wanted.get(name)!r}: choose another folder, the same configuration, or start afresh"
-                )
+        if difference := first_difference(there, config):
+            name, found, wanted = difference
+            raise TrainingError(
+                f"{self.path} holds a training with {name} = {found!r}, not {wanted!r}: choose another folder, the same "
+                "configuration, or start afresh"
+            )
+
+    @property
+    def threads(self) -> int | None:
+        """Threads that the training in the folder runs with; None: not known."""
+        try:
+            threads = read_json(self.path / ENVIRONMENT, TrainingError, "").get("threads")
+        except TrainingError:
+            return None
+        return threads if isinstance(threads, int) and threads > 0 else None
 
     def write_environment(self, facts: Mapping[str, Any]) -> None:
         """Note what the training runs on."""
-        write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": _versions()})
+        versions = {"python": platform.python_version(), **versions_of("foretrace", "numpy", "safetensors", "torch")}
+        write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": versions})
 
     def write_split(self, batch: InteractionBatch, split: Split) -> None:
         """Note the ids of the interactions in each part, and what they were."""
@@ -188,20 +197,16 @@ class RunFolder:
         (self.path / RESUME).unlink(missing_ok=True)
 
 
-def fingerprint(batch: InteractionBatch, known: Sequence[str] = ()) -> str:
-    """A short hash of everything in a batch that a training can read, and of those constants that it knows."""
-    digest = hashlib.sha256()
-    for name in ("ids", "mask", "height", "times", "com", "pose", "length", "slip_index"):
-        digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
-    digest.update(np.ascontiguousarray(batch.support_points).tobytes())
-    digest.update("\n".join(batch.outcome.tolist()).encode())
-    for name in known:
-        digest.update(np.ascontiguousarray(getattr(batch, name)).tobytes())
-    return digest.hexdigest()[:16]
+def fingerprint(batch: InteractionBatch, context: Sequence[str] = ()) -> str:
+    """A short hash of everything in a batch that a training can read, and of the context that it is conditioned on."""
+    names = ("ids", "mask", "height", "times", "com", "pose", "length", "slip_index", "support_points")
+    arrays = [np.ascontiguousarray(getattr(batch, name)).tobytes() for name in names]
+    told = [np.ascontiguousarray(column_of(batch, name)).tobytes() for name in context]
+    return short_hash(*arrays, "\n".join(batch.outcome.tolist()).encode(), *told)
 
 
 def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
-    """Ids of the interactions in each part of a training's split; nothing if it was trained on other data.
+    """Ids of the interactions in each part of a training's split; empty if it was trained on other data.
 
     Args:
         run: Folder of the training.
@@ -227,7 +232,7 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
         part: ``train``, ``validation`` or ``test``.
 
     Raises:
-        TrainingError: The folder tells of no such part, or the data has not the interactions that were in it.
+        TrainingError: The folder has no such part, or the data lacks interactions that were in it.
     """
     file = Path(run) / SPLIT
     if not file.is_file():
@@ -251,30 +256,8 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
     return batch[rows]
 
 
-def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as one level, names joined by dots."""
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
-
-
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
-
-
-def _versions() -> dict[str, str]:
-    names = ("foretrace", "numpy", "safetensors", "torch")
-    versions = {"python": platform.python_version()}
-    for name in names:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 def git_commit() -> str | None:

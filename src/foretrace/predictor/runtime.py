@@ -1,10 +1,12 @@
-"""Where and how PyTorch computes: its device, its threads, its random numbers."""
+"""Runtime settings of PyTorch: device, threads, random numbers."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import torch
+from torch import nn
 
 from foretrace.errors import TrainingError
 
@@ -34,10 +36,25 @@ def seeded(seed: int, epoch: int, device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def thread_count(threads: int | None) -> Iterator[None]:
-    """PyTorch with so many threads for a while; None leaves its choice."""
+    """PyTorch with a number of threads for a while; None: with as many as before."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads or before)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def suitable_threads(network: nn.Module) -> int:
+    """Threads with which a network trains well on the CPU.
+
+    One without convolutions: its products are too small to share. Else the cores that are idle, by the system's load
+    in the last minute, and at most as many as PyTorch takes by itself, which is the number of physical cores.
+    """
+    if not any(isinstance(module, nn.Conv2d) for module in network.modules()):
+        return 1
+    most = torch.get_num_threads()
+    if not hasattr(os, "getloadavg"):
+        return most
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(most, round(cores - os.getloadavg()[0])))

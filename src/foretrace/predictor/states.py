@@ -1,4 +1,4 @@
-"""What a predictor's state is made of, and the way from recorded trajectories to states and back."""
+"""The state of a predictor, and the way from recorded trajectories to states and back."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -27,14 +27,14 @@ STATE_GROUPS: dict[StateKind, tuple[int, ...]] = {"position": (3,), "pose": (3, 
 
 @dataclass(frozen=True)
 class Effects:
-    """What happened in interactions, as learned from."""
+    """Effects to learn from."""
 
     states: Float[Tensor, "batch time state"]
     """Normalised states; zeros past the end of a shorter trajectory."""
     lengths: Int[Tensor, " batch"]
     """Samples of each trajectory that count."""
     outcomes: Int[Tensor, " batch"]
-    """Which of the outcomes that the predictor tells apart became of each."""
+    """Number of each one's outcome among those that the predictor distinguishes."""
 
     def __len__(self) -> int:
         return len(self.states)
@@ -95,6 +95,14 @@ def decode_poses(states: Float[np.ndarray, "*batch state"]) -> Float[np.ndarray,
     else:
         quaternions = matrix_to_quaternion(rotation_from_6d(turned))
     return np.concatenate([states[..., :3], quaternions], axis=-1)
+
+
+def decode_turns(states: Float[np.ndarray, "*batch time state"]) -> Float[np.ndarray, "*batch time 3"] | None:
+    """Rotation vectors since rest [rad] in states; None if they are positions."""
+    turned = states[..., 3:]
+    if turned.shape[-1] == 6:
+        return continuous_rotation_vectors(rotation_from_6d(turned))
+    return turned if turned.shape[-1] else None
 
 
 def state_statistics(

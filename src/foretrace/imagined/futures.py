@@ -6,41 +6,74 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from foretrace.errors import PredictionError
 from foretrace.geometry import rotation_vector_to_quaternion
 from foretrace.interactions.record import Outcome
 
 LEVELS = np.arange(1, 100) / 100
-"""Probabilities of the regions whose widths a predictor keeps."""
+"""Levels of the prediction regions whose widths a predictor keeps."""
 MIN_PROBABILITY = 0.05
 """A future less probable than this belongs to no region, unless it is the most probable one."""
 FLOOR = 1e-4
-"""Nobody is surer of a position than this [m]: what half the time step changes in simulation is a fifth of it."""
+"""Least uncertainty of a position [m]: halving the simulation's time step changes a fifth of it."""
 STEADY = 2
-"""An observed motion is compared with a future by the mean of its last so many samples: they are noisy."""
+"""Number of the last observed samples whose mean is compared with a future: single ones are noisy."""
 DRIFT_SAMPLES = 10
-"""Over so many samples before, the distance from a future should not have changed."""
+"""Number of samples over which the distance from a future should stay the same."""
 DRIFT = 2e-3
-"""A change by this makes a future half as probable [m]."""
+"""Change of that distance that makes a future half as probable [m]."""
 FORGET_TIME = 0.3
-"""An object that falls forgets within this time that it was not where it was expected [s]; it lands on the table."""
+"""Time constant in which a falling object loses its offset from the expected position [s]: it lands on the table."""
 
 
 @dataclass(frozen=True)
 class Futures:
-    """What may happen in interactions: whole motions that exclude each other."""
+    """Motions that may happen in interactions, which exclude each other."""
 
     probability: Float[np.ndarray, "batch futures"]
-    """Of each; they sum up to 1."""
+    """Probability of each; they sum up to 1."""
     outcome: tuple[str, ...]
-    """What becomes of the object in each."""
+    """Outcome of each."""
     states: Float[np.ndarray, "batch futures time 6"]
-    """Positions of the centre of mass in the action frame [m] and rotation vectors since rest [rad]."""
+    """Positions of the centre of mass in the action frame [m] and rotation vectors since rest [rad]; the latter are
+    NaN where only positions are predicted."""
     spread: Float[np.ndarray, "batch futures time"]
-    """Expected distance of the centre of mass from it (root mean square) [m]."""
+    """Expected distance of the centre of mass from it (root mean square) [m]; NaN: unknown."""
     support_points: Float[np.ndarray, "batch futures 2 2"]
-    """Ends of the edge that the object turns about, in the action frame at rest [m]."""
+    """Ends of the edge that the object turns about, in the action frame at rest [m]; NaN: unknown."""
     quantiles: Float[np.ndarray, " levels"]
-    """How many spreads away from the nearest future whole motions stayed in the validation part, by `LEVELS`."""
+    """Distance from the nearest future, in spreads, within which whole motions of the validation part stayed, by
+    `LEVELS`; NaN: unknown."""
+
+    @classmethod
+    def point(
+        cls,
+        com: Float[np.ndarray, "batch time 3"],
+        turned: Float[np.ndarray, "batch time 3"] | None,
+        outcome: str,
+    ) -> "Futures":
+        """Futures of a point predictor: one for each interaction, of unknown spread.
+
+        Args:
+            com: Centres of mass in the action frame [m].
+            turned: Rotation vectors since rest [rad]; None: not predicted.
+            outcome: The outcome that the predictor was trained on.
+        """
+        n, time, _ = com.shape
+        turned = np.full_like(com, np.nan) if turned is None else turned
+        return cls(
+            probability=np.ones((n, 1)),
+            outcome=(outcome,),
+            states=np.concatenate([com, turned], axis=-1)[:, None],
+            spread=np.full((n, 1, time), np.nan),
+            support_points=np.full((n, 1, 2, 2), np.nan),
+            quantiles=np.full(len(LEVELS), np.nan),
+        )
+
+    @property
+    def is_point(self) -> bool:
+        """Whether there is one future alone, whose spread is unknown."""
+        return len(self.outcome) == 1 and bool(np.isnan(self.spread).all())
 
     def __len__(self) -> int:
         return len(self.probability)
@@ -63,30 +96,34 @@ class Futures:
 
     @property
     def counted(self) -> np.ndarray:
-        """(batch, futures) bool: which futures are probable enough to belong to regions."""
+        """Futures that are probable enough to belong to regions: (batch, futures) bool."""
         best = self.probability.max(axis=1, keepdims=True)
         return self.probability >= np.minimum(best, MIN_PROBABILITY)
 
     def radius(self, level: float) -> Float[np.ndarray, "batch futures time"]:
-        """Radii of tubes [m] about those futures that count: whole motions stay in one of them with that probability.
+        """Radii of the prediction region about each future that counts [m]: whole motions stay in one of them.
 
-        NaN for a future that does not count; infinite where the validation part was too small to tell.
+        NaN for a future that does not count or whose spread is unknown; infinite where the validation part was too
+        small.
+
+        Args:
+            level: Probability with which a motion stays in the region.
 
         Raises:
-            ValueError: The level is not between 0.01 and 0.99.
+            PredictionError: The level is not between 0.01 and 0.99.
         """
         if not LEVELS[0] <= level <= LEVELS[-1]:
-            raise ValueError(f"level {level} of a region: choose one from {LEVELS[0]} to {LEVELS[-1]}")
+            raise PredictionError(f"level {level} of a region: choose one from {LEVELS[0]} to {LEVELS[-1]}")
         wide = float(np.interp(level, LEVELS, self.quantiles))
         return np.where(self.counted[..., None], wide * (self.spread + FLOOR), np.nan)
 
     def given(self, observed: Float[np.ndarray, "batch samples 6"], sample_period: float) -> "Futures":
-        """What may happen after the first samples were observed.
+        """Futures after the first samples were observed.
 
-        An object that is not where it was expected, since the blade met it elsewhere, say, keeps that distance: all
-        that follows is moved and turned by it. What follows a slip forgets it, as it ends on the table. A future from
-        which the distance changes becomes less probable. Expected distances grow from the last observed sample on, as
-        those of a random walk, and more so the further that sample is off. Regions hold only roughly from then on.
+        An object that is off its expected position, since the blade met it elsewhere, for instance, keeps that offset:
+        everything that follows is moved and turned by it. After a slip the offset decays, as the object ends on the
+        table. A future whose offset changes becomes less probable. Spreads grow from the last observed sample on, as
+        those of a random walk, and faster the further that sample is off. Regions are only rough from then on.
 
         Args:
             observed: Positions in the action frame [m] and rotation vectors since rest [rad], from the start.
@@ -96,8 +133,8 @@ class Futures:
         off = observed[:, None] - self.states[:, :, :k]  # (batch, futures, k, 6)
         steady = off[:, :, -STEADY:].mean(axis=2, keepdims=True)
         drift = np.square(off - steady)[:, :, -DRIFT_SAMPLES:, :3].sum(axis=3).mean(axis=2)
-        odds = np.log(np.maximum(self.probability, 1e-30)) - np.log1p(drift / DRIFT**2)
-        odds = np.exp(odds - odds.max(axis=1, keepdims=True))
+        logits = np.log(np.maximum(self.probability, 1e-30)) - np.log1p(drift / DRIFT**2)
+        weights = np.exp(logits - logits.max(axis=1, keepdims=True))
         since = sample_period * np.arange(1, self.states.shape[2] - k + 1)
         falls = np.array([name == Outcome.SLIPPED for name in self.outcome])
         kept = np.where(falls[:, None], np.exp(-since / FORGET_TIME), 1.0)[..., None]
@@ -108,7 +145,7 @@ class Futures:
         rest = np.sqrt(np.maximum(self.spread[:, :, k:] ** 2 - last**2, 0.0)) * np.maximum(beyond, 1.0)
         return replace(
             self,
-            probability=odds / odds.sum(axis=1, keepdims=True),
+            probability=weights / weights.sum(axis=1, keepdims=True),
             states=states,
             spread=np.concatenate([np.zeros_like(self.spread[:, :, :k]), rest], axis=2),
         )
@@ -123,13 +160,13 @@ class Futures:
 def conformal_scores(
     futures: Futures, com: Float[np.ndarray, "batch time 3"], lengths: np.ndarray
 ) -> Float[np.ndarray, " batch"]:
-    """How many spreads motions were away, where they were furthest, from the future that they followed best.
+    """Largest distance of motions, in spreads, from the future that they follow best: their nonconformity.
 
-    A region of all motions with at most some score is a union of tubes about futures.
+    The region of all motions with at most some score is a union of tubes about futures.
 
     Args:
-        futures: What was expected.
-        com: What happened [m].
+        futures: Predicted futures.
+        com: Observed centres of mass [m].
         lengths: Samples of each that count.
     """
     apart = np.linalg.norm(futures.com - com[:, None], axis=-1) / (futures.spread + FLOOR)
@@ -139,52 +176,51 @@ def conformal_scores(
 
 
 def quantiles_of(scores: Float[np.ndarray, " n"]) -> Float[np.ndarray, " levels"]:
-    """Scores that further ones exceed with probabilities of 1 less `LEVELS` at most (split-conformal prediction).
+    """Quantiles of scores that a further score exceeds with probability 1 - `LEVELS` at most (split-conformal).
 
-    Vovk et al., 2005, "Algorithmic learning in a random world": exact for scores that could come in any order.
+    Vovk et al., 2005, "Algorithmic learning in a random world": exact for exchangeable scores.
     """
-    known = np.append(np.sort(scores), np.inf)
-    return known[np.minimum(np.ceil(LEVELS * len(known)).astype(int) - 1, len(scores))]
+    ordered = np.append(np.sort(scores), np.inf)
+    return ordered[np.minimum(np.ceil(LEVELS * len(ordered)).astype(int) - 1, len(scores))]
 
 
 @dataclass(frozen=True)
 class ImaginedEffect:
-    """The effect that a predictor expects of one action."""
+    """The effect that an imaginer expects of one action."""
 
     times: Float[np.ndarray, " time"]
     """Time of each sample [s], from the moment before the blade touches the object."""
     com_trajectory: Float[np.ndarray, "time 3"]
     """Centre of mass in the action frame [m]; the first row is the start that was given or estimated."""
-    pose_trajectory: Float[np.ndarray, "time 7"] | None = None
+    pose_trajectory: Float[np.ndarray, "time 7"] | None
     """Position of the centre of mass [m] and quaternion (w, x, y, z) of the rotation since rest, about the
-    action frame's axes: the identity at first. None if the predictor knows positions only."""
-    futures: Futures | None = None
-    """All that may happen, one row; the trajectories above are those of the most probable. None if the predictor
-    tells of one future only."""
+    action frame's axes: the identity at first. None if only positions are predicted."""
+    futures: Futures
+    """All futures, one row; the trajectories above are those of the most probable one."""
     warnings: tuple[str, ...] = ()
-    """In what the object is unlike those that the predictor has learned from, as far as it knows."""
+    """Respects in which object or action are unlike those that the predictor has learned from."""
 
 
 @dataclass(frozen=True)
 class ImaginedBatch:
-    """The effects that a predictor expects of many actions."""
+    """The effects that an imaginer expects of many actions."""
 
     times: Float[np.ndarray, " time"]
     """Time of each sample [s], common to all."""
     com: Float[np.ndarray, "batch time 3"]
     """Centres of mass in the action frame [m]."""
-    pose: Float[np.ndarray, "batch time 7"] | None = None
-    """As ``ImaginedEffect.pose_trajectory``, one per interaction."""
-    futures: Futures | None = None
-    """As ``ImaginedEffect.futures``, one row per interaction."""
+    pose: Float[np.ndarray, "batch time 7"] | None
+    """As ``ImaginedEffect.pose_trajectory``, one for each action."""
+    futures: Futures
+    """As ``ImaginedEffect.futures``, one row for each action."""
     warnings: tuple[tuple[str, ...], ...] = ()
-    """As ``ImaginedEffect.warnings``, one per interaction; or none at all, where nobody looked."""
+    """As ``ImaginedEffect.warnings``, one entry for each action."""
 
     def __len__(self) -> int:
         return len(self.com)
 
     def __getitem__(self, index: int) -> ImaginedEffect:
         pose = None if self.pose is None else self.pose[index]
-        futures = None if self.futures is None else self.futures[np.array([index])]
+        futures = self.futures[np.array([index])]
         warnings = self.warnings[index] if self.warnings else ()
         return ImaginedEffect(self.times, self.com[index], pose, futures, warnings)

@@ -1,0 +1,35 @@
+"""What an imaginer is and what it returns: the expected effect, all futures, their probabilities and regions.
+
+Nothing here imports a learning library: a predictor that was trained is one kind of imaginer among others.
+"""
+
+from foretrace.imagined.futures import (
+    FLOOR,
+    LEVELS,
+    MIN_PROBABILITY,
+    Futures,
+    ImaginedBatch,
+    ImaginedEffect,
+    conformal_scores,
+    quantiles_of,
+)
+from foretrace.imagined.imaginer import STARTS, Imaginer, Start
+from foretrace.imagined.observed import ObservedMotion
+from foretrace.imagined.scenes import Scenes, estimate_com
+
+__all__ = [
+    "FLOOR",
+    "LEVELS",
+    "MIN_PROBABILITY",
+    "STARTS",
+    "Futures",
+    "ImaginedBatch",
+    "ImaginedEffect",
+    "Imaginer",
+    "ObservedMotion",
+    "Scenes",
+    "Start",
+    "conformal_scores",
+    "estimate_com",
+    "quantiles_of",
+]

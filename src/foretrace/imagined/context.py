@@ -1,0 +1,151 @@
+"""Context of a prediction: constants and parameters that it is conditioned on beside the view (paper, section 6)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+import numpy as np
+from jaxtyping import Float
+
+from foretrace.actions import USUAL_STROKE, LeverUp
+from foretrace.errors import PredictionError, TrainingError
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.record import Physics
+
+CONSTANTS = {
+    "friction": "of object and table",
+    "tool_friction": "of object and blade",
+    "density": "in kg/m^3",
+}
+"""Physical constants by their names in `Physics`."""
+PARAMETERS = {
+    "insertion": "in m",
+    "arc_radius": "in m",
+    "sweep": "in rad",
+    "speed": "as a multiple of the nominal one",
+}
+"""Parameters of the action's path by name."""
+CONTEXT = CONSTANTS | PARAMETERS
+"""Everything that a predictor may be conditioned on."""
+SAME = 1e-9
+"""Values of a parameter that differ by less are the same."""
+
+
+def check_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of conditioning variables, each once.
+
+    Raises:
+        TrainingError: One of them is unknown, or comes twice.
+    """
+    for name in names:
+        if name not in CONTEXT:
+            raise TrainingError(f"{name!r} is no context of a prediction: choose from {', '.join(CONTEXT)}")
+        if list(names).count(name) > 1:
+            raise TrainingError(f"{name!r} is named twice in the context: name it once")
+    return tuple(names)
+
+
+def nominal_parameters() -> dict[str, float]:
+    """Parameters of the nominal path."""
+    return asdict(USUAL_STROKE)
+
+
+def parameters_of(action: LeverUp) -> dict[str, float]:
+    """Parameters of an action's path, by name."""
+    return nominal_parameters()
+
+
+def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
+    """Recorded values of one constant or parameter."""
+    return getattr(batch, name)
+
+
+def true_context(
+    physics: Physics, names: Sequence[str], parameters: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """True values of one interaction's context, in SI units, by the given names; those of the nominal path by default."""
+    values = asdict(physics) | dict(nominal_parameters() if parameters is None else parameters)
+    return {name: values[name] for name in names}
+
+
+def recorded_context(batch: InteractionBatch, names: Sequence[str]) -> Float[np.ndarray, "batch context"]:
+    """Recorded context of interactions, in SI units.
+
+    Raises:
+        PredictionError: One of them lacks a value.
+    """
+    values = np.array([column_of(batch, name) for name in names], dtype=float).reshape(len(names), len(batch)).T
+    rows, columns = np.nonzero(~np.isfinite(values))
+    if len(rows):
+        name = names[columns[0]]
+        raise PredictionError(
+            f"interaction {batch.ids[rows[0]]} has {name} = {values[rows[0], columns[0]]}: record its {name}, leave "
+            f"it out, or use a predictor that is not conditioned on {name}"
+        )
+    return values
+
+
+def given_context(
+    names: Sequence[str], context: Mapping[str, float] | None, parameters: Mapping[str, float] | None = None
+) -> Float[np.ndarray, "1 context"]:
+    """Context of one action, in SI units.
+
+    Args:
+        names: The variables that the predictor is conditioned on.
+        context: Values that were given.
+        parameters: Parameters of the action's path, where the action was given; ``context`` may add to them.
+
+    Raises:
+        PredictionError: A value is missing, is no finite number, contradicts the action's path, or is none that the
+            predictor is conditioned on.
+    """
+    context = {} if context is None else dict(context)
+    known = {name: value for name, value in (parameters or {}).items() if name in names} | context
+    if missing := [name for name in names if name not in known]:
+        wanted = ", ".join(f"{name!r}: value {CONTEXT[name]}" for name in names)
+        raise PredictionError(f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}")
+    if odd := [name for name in context if name not in names]:
+        accepted = ", ".join(names) or "nothing but the view"
+        raise PredictionError(
+            f"the predictor is conditioned on {accepted}, not on {odd[0]!r}: leave it out of context"
+        )
+    for name in names:
+        value = known[name]
+        if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
+            raise PredictionError(f"context {name} is {value!r}: give a finite value {CONTEXT[name]}")
+    nominal = nominal_parameters()
+    for name, value in (parameters or {}).items():
+        if name in context and not _same(value, nominal[name]) and not _same(value, context[name]):
+            raise PredictionError(
+                f"context {name} is {context[name]}, the action's path has {value}: give one of the two"
+            )
+    return np.array([[known[name] for name in names]], dtype=float).reshape(1, len(names))
+
+
+def find_unconditioned(
+    parameters: Mapping[str, Float[np.ndarray, " batch"]], names: Sequence[str]
+) -> tuple[tuple[str, ...], ...]:
+    """Warnings about paths that differ from the nominal one in what a predictor is not conditioned on.
+
+    Args:
+        parameters: Values of each parameter; NaN: unknown.
+        names: The variables that the predictor is conditioned on.
+
+    Returns:
+        The lines of each action.
+    """
+    nominal = nominal_parameters()
+    number = len(next(iter(parameters.values())))
+    warnings: list[list[str]] = [[] for _ in range(number)]
+    for name, values in parameters.items():
+        if name in names:
+            continue
+        for row in np.flatnonzero(np.abs(values - nominal[name]) > SAME):
+            warnings[row].append(
+                f"{name} {values[row]:.3g} is not the nominal {nominal[name]:.3g}, and the predictor is not "
+                "conditioned on it"
+            )
+    return tuple(map(tuple, warnings))
+
+
+def _same(one: float, other: float) -> bool:
+    return abs(one - other) <= SAME

@@ -1,0 +1,245 @@
+"""Views that an imaginer accepts, and warnings about objects that are unlike those it has learned from."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from foretrace.errors import PredictionError
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
+
+LARGEST_GAP = 0.02
+"""Largest distance of a contact point from the object's rim, outside or inside [m]."""
+RELEVANT_SHARE = 0.05
+"""A spot in the mask with more than this share of the largest one's pixels is an object of its own."""
+QUANTILES = (0.01, 0.99)
+"""Quantiles of the training part between which an object is usual."""
+MARGIN = 0.25
+"""An object is unusual if it is further outside than this share of the range."""
+LEAST_MARGIN = 0.1
+"""The same as a share of the range's upper end, for measures that hardly differ in the training part."""
+MEASURES = {
+    "area": (1e4, "cm^2"),
+    "length": (100.0, "cm"),
+    "width": (100.0, "cm"),
+    "height": (100.0, "cm"),
+    "distance": (100.0, "cm"),
+    "corners": (1.0, ""),
+}
+"""Measures by which objects are compared: factor from SI units to the unit of messages, and that unit. Length and width
+are along and across the action, the distance is that from contact to centre of mass in the plane."""
+
+Ranges = Mapping[str, tuple[float, float]]
+"""Lower and upper end of measures in a training part, by name [SI]."""
+
+_BEHIND = METRES_PER_PIXEL * (round(CONTACT_PIXEL[0] + LARGEST_GAP / METRES_PER_PIXEL) - CONTACT_PIXEL[0])
+"""Distance behind the contact point at which an object levered at its rim has ended [m]: the middle of a row."""
+OWN = np.zeros((1, 2)), np.array([[1.0, 0.0]])
+"""Contact point and direction of a view's own action."""
+
+
+def check_view(view: TopDownView) -> None:
+    """Refuse a view that does not show one object, levered at its rim.
+
+    Raises:
+        PredictionError: See `check_object` and `check_contacts`.
+    """
+    check_object(view.mask, view.height)
+    check_contacts(view.mask, *OWN)
+
+
+def check_object(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> None:
+    """Refuse a view that does not show one object.
+
+    Raises:
+        PredictionError: No object, several or a part of one are seen, or a height is impossible.
+    """
+    if not mask.any():
+        raise PredictionError("the view's mask is empty: see that the camera sees the object")
+    if mask[[0, -1]].any() or mask[:, [0, -1]].any():
+        raise PredictionError(
+            "the object touches the border of the view, a part of it may not be seen: choose another contact point"
+        )
+    lowest, highest = float(height.min()), float(height.max())
+    if not (np.isfinite(lowest) and np.isfinite(highest)):
+        raise PredictionError("a height in the view is not finite: put 0 where no height was measured")
+    if lowest < 0:
+        raise PredictionError(
+            f"a height in the view is {lowest:.4f} m, below the table: check the camera's pose"
+        )
+    if height[~mask].any():
+        raise PredictionError(
+            f"the view has heights up to {height[~mask].max():.4f} m outside the mask: give 0 beside the object, or "
+            "a mask of all that has a height"
+        )
+    outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    if len(outlines) > 1:  # of several objects, or of holes
+        _, _, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
+        sizes = stats[1:, cv2.CC_STAT_AREA]
+        if (count := int((sizes > RELEVANT_SHARE * sizes.max()).sum())) > 1:
+            raise PredictionError(f"the view's mask shows {count} objects: leave one of them")
+
+
+def check_contacts(
+    mask: Bool[np.ndarray, "128 128"],
+    contacts: Float[np.ndarray, "n 2"],
+    directions: Float[np.ndarray, "n 2"],
+    names: Sequence[str] = ("",),
+) -> None:
+    """Refuse actions that do not start at the rim of the object in a view and lead into it.
+
+    Args:
+        mask: The view's mask, not empty.
+        contacts: Contact points in the view's frame [m].
+        directions: Unit vectors of the actions in that frame.
+        names: Beginning of the message about each of them.
+
+    Raises:
+        PredictionError: The object lies behind the contact point, away from it, around it, or beyond the window of
+            the action's view.
+    """
+    rim = _rim(mask)
+    rows, columns = mask.sum(axis=1), mask.sum(axis=0)
+    middle = np.array([rows @ np.arange(len(rows)), columns @ np.arange(len(columns))]) / rows.sum()
+    ahead = ((CONTACT_PIXEL - middle) * METRES_PER_PIXEL - contacts) * directions
+    for name, distance in zip(names, ahead.sum(axis=1), strict=True):
+        if distance <= 0:
+            raise PredictionError(
+                f"{name}the object lies behind the contact point, its middle by {-100 * distance:.1f} cm: turn "
+                "the action's direction round"
+            )
+    apart = np.linalg.norm(rim - contacts[:, None], axis=2).min(axis=1)
+    apart[_look_up(mask, contacts)] = 0.0
+    for name, gap in zip(names, apart, strict=True):
+        if gap > LARGEST_GAP + METRES_PER_PIXEL / 2:
+            raise PredictionError(
+                f"{name}the contact point is {100 * gap:.1f} cm from the object, more than "
+                f"{100 * LARGEST_GAP:.0f} cm: choose one at its rim"
+            )
+    left = np.stack([-directions[:, 1], directions[:, 0]], axis=1) * METRES_PER_PIXEL / 2
+    behind = contacts - _BEHIND * directions
+    inside = _look_up(mask, behind + left) & _look_up(mask, behind - left)
+    if inside.any():
+        raise PredictionError(
+            f"{names[int(inside.argmax())]}the contact point lies in the object, which is still there "
+            f"{100 * LARGEST_GAP:.0f} cm behind it: choose one at its rim"
+        )
+    x, y = _along(rim, contacts, directions)
+    pixels = CONTACT_PIXEL[:, None, None] - np.stack([x, y]) / METRES_PER_PIXEL
+    cut = ((pixels < 0.5) | (pixels > VIEW_SIZE - 1.5)).any(axis=(0, 2))
+    if cut.any():
+        raise PredictionError(
+            f"{names[int(cut.argmax())]}the object reaches beyond the view from that contact point: choose another one"
+        )
+
+
+def _rim(mask: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "k 2"]:
+    """Middles of the outermost pixels of a mask [m]."""
+    kept = mask.view(np.uint8)
+    inner = np.asarray(cv2.erode(kept, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT, borderValue=0))
+    return (CONTACT_PIXEL - np.argwhere(kept > inner)) * METRES_PER_PIXEL
+
+
+def _look_up(mask: Bool[np.ndarray, "rows columns"], points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Whether points [m] lie in the mask."""
+    pixels = np.rint(CONTACT_PIXEL - points / METRES_PER_PIXEL).astype(int)
+    there = ((pixels >= 0) & (pixels < mask.shape)).all(axis=1)
+    rows, columns = np.where(there[:, None], pixels, 0).T
+    return there & mask[rows, columns]
+
+
+def _along(
+    points: Float[np.ndarray, "k 2"], contacts: Float[np.ndarray, "n 2"], directions: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+    """Coordinates of points in the frames of actions [m]."""
+    left = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
+    return tuple(axes @ points.T - (axes * contacts).sum(axis=1)[:, None] for axes in (directions, left))
+
+
+def measure(
+    batch: InteractionBatch, com: Float[np.ndarray, "batch 3"]
+) -> dict[str, Float[np.ndarray, " batch"]]:
+    """Measures by which objects are compared [SI], by the names of ``MEASURES``.
+
+    Args:
+        batch: The objects as seen from above.
+        com: Their centres of mass at rest in the action frame [m].
+    """
+    return {
+        "area": np.count_nonzero(batch.mask, axis=(1, 2)) * METRES_PER_PIXEL**2,
+        "length": _extent(np.asarray(batch.mask.any(axis=2))),
+        "width": _extent(np.asarray(batch.mask.any(axis=1))),
+        "height": batch.height.max(axis=(1, 2)).astype(float),
+        "distance": np.hypot(com[:, 0], com[:, 1]),
+    }
+
+
+def measure_from(
+    view: TopDownView,
+    contacts: Float[np.ndarray, "n 2"],
+    directions: Float[np.ndarray, "n 2"],
+    com: Float[np.ndarray, "n 3"],
+) -> dict[str, Float[np.ndarray, " n"]]:
+    """The same of one object as seen from the frames of several actions.
+
+    Args:
+        view: The object.
+        contacts: Contact points in the view's frame [m].
+        directions: Unit vectors of the actions in that frame.
+        com: Its centre of mass at rest in the frame of each action [m].
+    """
+    x, y = _along(_rim(view.mask), contacts, directions)
+    number = len(contacts)
+    return {
+        "area": np.full(number, np.count_nonzero(view.mask) * METRES_PER_PIXEL**2),
+        "length": np.ptp(x, axis=1) + METRES_PER_PIXEL,
+        "width": np.ptp(y, axis=1) + METRES_PER_PIXEL,
+        "height": np.full(number, float(view.height.max())),
+        "distance": np.hypot(com[:, 0], com[:, 1]),
+    }
+
+
+def _extent(filled: np.ndarray) -> Float[np.ndarray, " batch"]:
+    """Distance from the first to the last pixel [m]."""
+    return (filled.shape[1] - filled.argmax(axis=1) - filled[:, ::-1].argmax(axis=1)) * METRES_PER_PIXEL
+
+
+def ranges_of(measures: Mapping[str, Float[np.ndarray, " batch"]]) -> dict[str, tuple[float, float]]:
+    """Range of each measure in a training part."""
+    return {
+        name: (float(np.quantile(values, QUANTILES[0])), float(np.quantile(values, QUANTILES[1])))
+        for name, values in measures.items()
+    }
+
+
+def read_ranges(found: Any) -> dict[str, tuple[float, float]]:
+    """Ranges in a configuration file; none where it has no such entry.
+
+    Raises:
+        TypeError, ValueError, AttributeError: They have another form.
+    """
+    return {
+        name: (float(low), float(high)) for name, (low, high) in (found or {}).items() if name in MEASURES
+    }
+
+
+def find_unusual(
+    measures: Mapping[str, Float[np.ndarray, " batch"]], ranges: Ranges
+) -> tuple[tuple[str, ...], ...]:
+    """Warnings about each object that is unlike those of a training part; none without ranges."""
+    number = len(measures["area"])
+    warnings: list[list[str]] = [[] for _ in range(number)]
+    for name, (low, high) in ranges.items():
+        if name not in measures:
+            continue
+        values, margin = measures[name], max(MARGIN * (high - low), LEAST_MARGIN * abs(high))
+        for row in np.flatnonzero((values < low - margin) | (values > high + margin)):
+            factor, unit = MEASURES[name]
+            warnings[row].append(
+                f"{name} {factor * values[row]:.3g}{unit and ' '}{unit} is far outside what was learned from, "
+                f"{factor * low:.3g} to {factor * high:.3g}{unit and ' '}{unit}"
+            )
+    return tuple(map(tuple, warnings))

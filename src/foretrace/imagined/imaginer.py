@@ -1,0 +1,257 @@
+"""The contract of everything that imagines effects: one door with the same checks, warnings and shapes."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import ClassVar, Literal, final
+
+import numpy as np
+from jaxtyping import Float
+
+from foretrace.actions import LeverUp
+from foretrace.errors import PredictionError
+from foretrace.geometry import Numbers
+from foretrace.imagined.context import (
+    PARAMETERS,
+    column_of,
+    find_unconditioned,
+    given_context,
+    parameters_of,
+    recorded_context,
+)
+from foretrace.imagined.domain import OWN, check_contacts, check_object, check_view
+from foretrace.imagined.futures import ImaginedBatch, ImaginedEffect
+from foretrace.imagined.observed import SAME_TIME, ObservedMotion, observed_motion, rotations_since_rest
+from foretrace.imagined.scenes import Scenes, estimate_com
+from foretrace.interactions.candidates import Candidates
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.record import Effect
+from foretrace.interactions.topdown import TopDownView
+
+Start = Literal["observed", "estimated"]
+"""Where a motion's centre of mass at rest comes from: the first recorded sample, or the view from above."""
+STARTS: tuple[Start, ...] = ("observed", "estimated")
+
+
+class Imaginer(ABC):
+    """Imagines the effect of an action on an object seen from above (paper, section 3).
+
+    `imagine`, `imagine_batch` and `imagine_candidates` are final: they check what they are given, find the context, and
+    turn it into `Scenes`. A subclass answers those in `imagine_scenes`.
+    """
+
+    context: tuple[str, ...] = ()
+    """Variables that it is conditioned on beside the view: names of `foretrace.imagined.context.CONTEXT`."""
+    observes: ClassVar[bool] = False
+    """Whether it can be shown the first samples of a motion that is under way."""
+
+    @property
+    @abstractmethod
+    def sample_times(self) -> Float[np.ndarray, " time"]:
+        """Times of the imagined samples [s]; the samples that it can be shown are the first of these."""
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return type(self).__name__
+
+    @property
+    def needs_effect(self) -> str | None:
+        """What it reads that only the effect reveals, so that it cannot imagine from a view; None: nothing."""
+        return None
+
+    @abstractmethod
+    def imagine_scenes(self, scenes: Scenes) -> ImaginedBatch:
+        """Imagine the effects in scenes that have been checked, one row each, with warnings about their objects."""
+
+    @final
+    def imagine(
+        self,
+        view: TopDownView,
+        action: LeverUp | None = None,
+        *,
+        context: Mapping[str, float] | None = None,
+        observed: Effect | ObservedMotion | None = None,
+        com: Numbers | None = None,
+    ) -> ImaginedEffect:
+        """Imagine the effect of the action in whose frame an object is seen.
+
+        Args:
+            view: The object from above, in the action frame.
+            action: The action. Its path's parameters are context; a path that is not nominal is pointed out if the
+                imaginer is not conditioned on it. Where it acts is told by the view's frame. None: the nominal path.
+            context: Values of the variables that the imaginer is conditioned on, by name [SI].
+            observed: Beginning of the motion, where it is under way: the record's own `Effect`, or poses with times.
+            com: The centre of mass at rest in the action frame [m]. By default that of the observed motion, or the one
+                estimated from the view: above the centre of the mask's area, at half the object's greatest height.
+
+        Raises:
+            PredictionError: The view does not show one object that is levered at its rim; the imaginer cannot do
+                without the effect; a context value is missing, not finite, contradictory or of no use; or the observed
+                motion cannot be used.
+        """
+        self._check_sight()
+        _check_type("view", view, TopDownView)
+        check_view(view)
+        parameters = {}
+        if action is not None:
+            _check_type("action", action, LeverUp)
+            parameters = parameters_of(action)
+        values = given_context(self.context, context, parameters)
+        batch = InteractionBatch.from_views([view])
+        motion = None if observed is None else observed_motion(observed)
+        if com is None and motion is not None and motion.com is not None:
+            com = motion.com[0]
+        start = estimate_com(batch)[0] if com is None else _point(com)
+        seen = None
+        if motion is not None:
+            self._check_observes()
+            seen = motion.states(self.sample_times, start)[None]
+        return self._answer(Scenes(batch, start[None], values, seen), [parameters])[0]
+
+    @final
+    def imagine_batch(
+        self, batch: InteractionBatch, start: Start = "observed", observed: int = 0
+    ) -> ImaginedBatch:
+        """Imagine the effects of many actions, of which some may have been recorded.
+
+        Args:
+            batch: The interactions. Of their trajectories only the first sample is read, and not even that if
+                ``start`` is ``estimated``; of their constants and parameters those of the context.
+            start: Where the centre of mass at rest comes from: the first recorded sample, or the view.
+            observed: Number of recorded samples of each motion that are shown to the imaginer.
+
+        Raises:
+            PredictionError: As `imagine`, naming the interaction; or no first sample was recorded.
+        """
+        _check_type("batch", batch, InteractionBatch)
+        if start not in STARTS:
+            raise PredictionError(f"start is {start!r}: choose from {', '.join(STARTS)}")
+        most = len(self.sample_times) - 1
+        if isinstance(observed, bool) or not isinstance(observed, int | np.integer) or observed < 0:
+            raise PredictionError(f"observed is {observed!r}: give a number of samples from 0 to {most}")
+        for id, mask, height in zip(batch.ids, batch.mask, batch.height, strict=True):
+            with _naming(f"interaction {id}: "):
+                check_object(mask, height)
+                check_contacts(mask, *OWN)
+        values = recorded_context(batch, self.context)
+        com = estimate_com(batch)
+        if start == "observed":
+            com = batch.com[:, 0] if batch.com.shape[1] else np.full_like(com, np.nan)
+            if not (there := np.isfinite(com).all(axis=1)).all():
+                raise PredictionError(
+                    f"interaction {batch.ids[~there][0]} has no recorded centre of mass: take start='estimated'"
+                )
+        seen = self._observe_batch(batch, int(observed)) if observed else None
+        parameters = {name: column_of(batch, name) for name in PARAMETERS}
+        return self._answer(Scenes(batch, com, values, seen), parameters)
+
+    @final
+    def imagine_candidates(
+        self,
+        view: TopDownView,
+        actions: Iterable[LeverUp],
+        *,
+        context: Mapping[str, float] | None = None,
+        com: Numbers | None = None,
+    ) -> ImaginedBatch:
+        """Imagine the effects of several actions on one object from a single view.
+
+        Args:
+            view: The object from above, in any action frame; contact and direction of that frame do not matter.
+            actions: The actions, in the view's frame: contact points [m] and directions there, and their paths.
+            context: As of `imagine`, the same for all.
+            com: The centre of mass at rest in the view's frame [m]; by default estimated from the view.
+
+        Returns:
+            One row for each action, in the frame of its own action.
+
+        Raises:
+            PredictionError: As `imagine`, naming the candidate; or there is none.
+        """
+        self._check_sight()
+        _check_type("view", view, TopDownView)
+        check_object(view.mask, view.height)
+        actions = tuple(actions)
+        if not actions:
+            raise PredictionError("there is no candidate to imagine: give at least one action")
+        for k, action in enumerate(actions):
+            _check_type(f"candidate {k}", action, LeverUp)
+        candidates = Candidates(view, actions)
+        names = [f"candidate {k}: " for k in range(len(actions))]
+        check_contacts(view.mask, candidates.contacts, candidates.directions, names)
+        parameters = [parameters_of(action) for action in actions]
+        values = []
+        for name, known in zip(names, parameters, strict=True):
+            with _naming(name):
+                values.append(given_context(self.context, context, known))
+        middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
+        scenes = Scenes(candidates, candidates.enter(middle), np.concatenate(values))
+        return self._answer(scenes, parameters)
+
+    def _answer(self, scenes: Scenes, parameters: list[dict[str, float]] | dict[str, np.ndarray]) -> ImaginedBatch:
+        """What it imagines, with warnings about paths that it is not conditioned on."""
+        if isinstance(parameters, list):
+            names = parameters[0]
+            parameters = {name: np.array([values[name] for values in parameters]) for name in names}
+        imagined = self.imagine_scenes(scenes)
+        about_objects = imagined.warnings or ((),) * len(scenes)
+        about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(scenes)
+        warnings = tuple(a + b for a, b in zip(about_objects, about_paths, strict=True))
+        return replace(imagined, warnings=warnings)
+
+    def _observe_batch(self, batch: InteractionBatch, count: int) -> Float[np.ndarray, "batch samples 6"]:
+        """The first recorded samples of each motion at the imaginer's sample times."""
+        self._check_observes()
+        if (short := batch.length < count).any():
+            raise PredictionError(
+                f"interaction {batch.ids[short][0]} has {batch.length[short][0]} samples, fewer than the "
+                f"{count} to be observed: leave it out or observe fewer"
+            )
+        times, wanted = batch.times[:count], self.sample_times
+        if count < len(wanted) and np.allclose(times, wanted[:count], rtol=0, atol=SAME_TIME):
+            turned = rotations_since_rest(batch.pose[:, :count])
+            return np.concatenate([batch.com[:, :count], turned], axis=-1)
+        seen = []
+        for id, poses, com in zip(batch.ids, batch.pose[:, :count], batch.com[:, :count], strict=True):
+            with _naming(f"interaction {id}: "):
+                seen.append(ObservedMotion(times, poses, com).states(wanted, com[0]))
+        return np.array(seen)
+
+    def _check_sight(self) -> None:
+        if self.needs_effect is not None:
+            raise PredictionError(
+                f"{self.needs_effect} are observed during the action and cannot be had from a view: use a predictor "
+                "with other features"
+            )
+
+    def _check_observes(self) -> None:
+        if not self.observes:
+            raise PredictionError(
+                f"the {self.name} predictor makes no use of observed samples: leave them out or use another one"
+            )
+
+
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """Errors begin with the name of what they are about."""
+    try:
+        yield
+    except PredictionError as error:
+        raise PredictionError(f"{name}{error}") from error
+
+
+def _check_type(name: str, value: object, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise PredictionError(f"{name} is a {type(value).__name__}: give a {kind.__name__}")
+
+
+def _point(com: Numbers) -> Float[np.ndarray, "3"]:
+    try:
+        point = np.array(com, dtype=float)
+    except (TypeError, ValueError):
+        point = np.full(0, np.nan)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise PredictionError(f"com is {com}: give a finite centre of mass (x, y, z) [m], or none")
+    return point

@@ -1,0 +1,136 @@
+"""Settings of a predictor and of its training, checked when they are made."""
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+
+from foretrace.errors import TrainingError
+from foretrace.features import FEATURES, FeatureExtractor, Option, make_features
+from foretrace.imagined.context import check_names
+from foretrace.interactions.record import Outcome
+from foretrace.interactions.splits import PAPER_SIZES
+
+if TYPE_CHECKING:
+    from foretrace.predictor.base import EffectPredictor
+
+Device = Literal["auto", "cpu", "cuda"]
+"""Where to compute."""
+TrainingPrecision = Literal["auto", "float32", "bfloat16"]
+"""Number format of convolutions in training."""
+
+
+def check_count(name: str, value: Any, most: int, least: int = 1) -> None:
+    """Refuse what is no whole number within limits.
+
+    Raises:
+        TrainingError: Naming the setting, its value and the limits.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise TrainingError(f"{name} is {value!r}: give a number from {least} to {most}")
+
+
+def check_choice(name: str, value: Any, choices: Any) -> None:
+    """Refuse what is none of some choices.
+
+    Raises:
+        TrainingError: Naming the setting, its value and the choices.
+    """
+    if value not in tuple(choices):
+        raise TrainingError(f"{name} is {value!r}: choose from {', '.join(map(str, choices))}")
+
+
+def check_outcomes(outcomes: Any) -> None:
+    """Refuse what is not one or more names of outcomes.
+
+    Raises:
+        TrainingError: There is none, or one is unknown.
+    """
+    if not outcomes or isinstance(outcomes, str):
+        raise TrainingError(f"outcomes is {outcomes!r}: name at least one, of {', '.join(Outcome)}")
+    for name in outcomes:
+        if name not in list(Outcome):
+            raise TrainingError(f"unknown outcome {name!r}; choose from {', '.join(Outcome)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Settings of a training loop; the defaults are the paper's where the paper says (section 4)."""
+
+    epochs: int = 15
+    """Passes over the training part, unless ``min_steps`` asks for more."""
+    min_steps: int = 300
+    """Optimiser steps, at least: a small training part is passed over more often."""
+    batch_size: int = 32
+    """Trajectories per optimiser step."""
+    learning_rate: float = 8e-3
+    """Adam's largest learning rate: it is reached after a tenth of the steps and falls to 0 along a cosine."""
+    outcomes: tuple[str, ...] | None = None
+    """Outcomes of the interactions to learn from; None: those that the predictor distinguishes, else levered."""
+    split: tuple[int, int, int] | None = PAPER_SIZES
+    """Sizes of the training, validation and test parts; None: in the paper's proportions."""
+    seed: int = 0
+    """Seed of the split, the first weights, the order and the dropout."""
+    device: Device = "auto"
+    """Where to compute; auto takes a CUDA device if there is one."""
+    precision: TrainingPrecision = "auto"
+    """Number format of the convolutions in training; auto takes what the device multiplies fastest."""
+    threads: int | None = None
+    """Threads of PyTorch on the CPU; None: one without convolutions, else as many as there are idle physical cores."""
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "min_steps", "batch_size"):
+            check_count(name, getattr(self, name), 1_000_000)
+        if self.threads is not None:
+            check_count("threads", self.threads, 1024)
+        rate = self.learning_rate
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < math.inf:
+            raise TrainingError(f"learning_rate is {rate!r}: give a finite number above 0")
+        if self.outcomes is not None:
+            check_outcomes(self.outcomes)
+        if self.split is not None:
+            if isinstance(self.split, int | str) or len(self.split) != 3:
+                raise TrainingError(f"split is {self.split!r}: give the sizes of three parts")
+            for size in self.split:
+                check_count("a part of the split", size, 1_000_000_000)
+        check_count("seed", self.seed, 2**63 - 1, least=0)
+        check_choice("device", self.device, get_args(Device))
+        check_choice("precision", self.precision, get_args(TrainingPrecision))
+
+    def num_epochs(self, size: int) -> int:
+        """Passes over a training part of a number of interactions."""
+        return max(self.epochs, math.ceil(self.min_steps / math.ceil(size / self.batch_size)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictorConfig:
+    """Settings that every predictor has; a subclass beside each predictor class adds its own."""
+
+    predictor_class: ClassVar["type[EffectPredictor]"]
+    """The class that is made; set when that is defined."""
+    training: ClassVar[TrainConfig] = TrainConfig()
+    """Recommended settings of its training."""
+
+    features: str = "none"
+    """Features of the object, by their label: what the predictor is told about it."""
+    feature_options: dict[str, Option] = field(default_factory=dict)
+    """Settings of the feature extractor, by name."""
+    context: tuple[str, ...] = ()
+    """Conditioning variables beside the view: friction, tool_friction, density; parameters of the action's path."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.context, str):
+            raise TrainingError(f"context is {self.context!r}: give the names in a tuple")
+        check_names(self.context)
+        FEATURES.find(self.features)
+
+    def make(self, num_samples: int) -> "EffectPredictor":
+        """The untrained predictor; its first weights are drawn from PyTorch's random numbers.
+
+        Args:
+            num_samples: Samples of a trajectory.
+        """
+        return self.predictor_class(self, num_samples)
+
+    def make_features(self) -> FeatureExtractor:
+        """The feature extractor."""
+        return make_features(self.features, **self.feature_options)
