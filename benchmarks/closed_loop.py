@@ -27,18 +27,19 @@ from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle,
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.recording_folder import read_image
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
 from foretrace.perception import masks
-from foretrace.perception.calibration import Board, calibrate, read_picture, read_pictures
-from foretrace.perception.films import open_film
-from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_film
+from foretrace.perception.calibration import Board, calibrate, read_images
+from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_recording
 from foretrace.perception.markers import MarkerLayout, detect_markers
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
-from foretrace.perception.views import PlacedObject, Sight, contact_at_pixel, place_object, see
+from foretrace.perception.recordings import open_recording
+from foretrace.perception.views import Observation, PlacedObject, contact_at_pixel, observe, place_object
 from foretrace.predictor import load_predictor
-from foretrace.simulation.film import FilmConfig, film_board, film_lever_up
 from foretrace.simulation.lens import WEBCAM
+from foretrace.simulation.recording import RecordingConfig, photograph_board, record_lever_up
 from foretrace.trajectories import mean_distance, warped_distance
 
 HEIGHT = 0.02
@@ -59,10 +60,10 @@ def subject(number: int) -> tuple[ObjectModel, LeverUp]:
     return obj, LeverUp.at_edge(obj, int(rng.integers(len(obj.corners))), float(rng.uniform(0.3, 0.7)))
 
 
-def film_config(number: int) -> FilmConfig:
+def film_config(number: int) -> RecordingConfig:
     rng = np.random.default_rng([4096, number])
     side = float(rng.choice([-1, 1]))
-    return FilmConfig(
+    return RecordingConfig(
         depth_every=10, azimuth=side * float(rng.uniform(0.5, 1.3)), slant=float(rng.uniform(0.5, 0.7))
     )
 
@@ -70,12 +71,12 @@ def film_config(number: int) -> FilmConfig:
 def make_films(root: Path, num: int) -> None:
     if not (root / "board").is_dir():
         (root / "board").mkdir(parents=True)
-        for k, picture in enumerate(film_board(BOARD.draw(4000.0), BOARD.size, seed=1)):
+        for k, picture in enumerate(photograph_board(BOARD.draw(4000.0), BOARD.size, seed=1)):
             cv2.imwrite(str(root / "board" / f"{k:02d}.png"), picture)
     for number in range(num):
         folder = root / f"{number:02d}"
         if not (folder / "truth.json").is_file():
-            film_lever_up(*subject(number), folder, film_config(number), seed=number)
+            record_lever_up(*subject(number), folder, film_config(number), seed=number)
             print(f"filmed {folder}", flush=True)
 
 
@@ -84,7 +85,7 @@ def make_still(folder: Path, number: int, **condition) -> None:
     if not (folder / "truth.json").is_file():
         config = replace(film_config(number), depth_every=1, **condition)
         short = 1.5 / config.frames_per_second - config.lead_time - config.simulation.path.duration
-        film_lever_up(*subject(number), folder, replace(config, tail_time=short), seed=number)
+        record_lever_up(*subject(number), folder, replace(config, tail_time=short), seed=number)
 
 
 def pointed_at(folder: Path, number: int) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
@@ -167,8 +168,8 @@ def picture_conditions(out: Path, root: Path) -> None:
         folder = root / name / f"{number}"
         T_table_camera, _, pixel = pointed_at(folder, number)
         sight = sight_of(folder, T_table_camera, WEBCAM, pixel, "background")
-        frame = next(open_film(folder).frames())
-        large = cv2.resize(frame.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        frame = next(open_recording(folder).frames())
+        large = cv2.resize(frame.image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
         outline = sight.placed.outline(HEIGHT)
         drawn = draw_overlay(large, WEBCAM.scaled(2), T_table_camera, outline, {})
         middle = WEBCAM.scaled(2).project(outline, invert_transform(T_table_camera)).mean(axis=0)
@@ -185,25 +186,24 @@ def sight_of(
     pixel: tuple[float, float],
     how: str,
     box: tuple[int, int, int, int] | None = None,
-) -> Sight:
+) -> Observation:
     """What the first frame alone shows of an object of unknown shape."""
-    frame = next(open_film(folder).frames())
+    frame = next(open_recording(folder).frames())
     if how == "depth":
         assert frame.depth is not None
         heights = masks.heights_above_table(frame.depth, camera, T_table_camera)
-        mask = masks.pick_object(masks.mask_by_height(heights), pixel)
+        mask = masks.find_by_height(heights, pixel)
         height, rim = masks.object_height(heights, mask), 0.008
     elif how == "grabcut":
         assert box is not None
-        mask = masks.pick_object(masks.mask_by_grabcut(frame.picture, box), pixel)
+        mask = masks.pick_object(masks.mask_by_grabcut(frame.image, box), pixel)
         height, rim = HEIGHT, 0.003
     else:
-        background = read_picture(folder / "background.png")
-        cover = masks.cover_by_background(frame.picture, background)
-        mask = masks.cover_of(cover, masks.pick_object(cover > 0.5, pixel))
+        background = read_image(folder / "background.png")
+        mask = masks.find_by_background(frame.image, background, pixel)
         height, rim = HEIGHT, 0.003
     placed = place_object(mask, camera, T_table_camera, height, rim, hull=True)
-    return see(placed, contact_at_pixel(placed, pixel, camera, T_table_camera))
+    return observe(placed, contact_at_pixel(placed, pixel, camera, T_table_camera))
 
 
 def overlap(a: TopDownView, b: TopDownView) -> float:
@@ -216,7 +216,9 @@ def measure(folder: Path, camera: PinholeCamera, predictor, picture: Path | None
     obj, action = subject(number)
     T_truth = pose_to_matrix(np.array(truth["object_poses_in_table"]))
     contact = Contact(point=(float(action.contact[0]), float(action.contact[1])))
-    found = import_film(open_film(folder), camera, MarkerLayout.load(folder / "markers.json"), contact, obj)
+    found = import_recording(
+        open_recording(folder), camera, MarkerLayout.load(folder / "markers.json"), contact, obj
+    )
     position = np.linalg.norm(found.T_table_object[:, :3, 3] - T_truth[:, :3, 3], axis=1)
     turn = rotation_angle(found.T_table_object[:, :3, :3], T_truth[:, :3, :3])
     # Somebody points at the contact in the first frame.
@@ -268,12 +270,12 @@ def save_picture(
     folder: Path,
     camera: PinholeCamera,
     found: Imported,
-    sight: Sight,
+    sight: Observation,
     path: np.ndarray,
     truth: dict,
     com,
 ) -> None:
-    frames = list(open_film(folder).frames())
+    frames = list(open_recording(folder).frames())
     there = np.isfinite(found.T_table_object[:, 0, 0])
     effect = found.interaction.effect
     until = found.start + effect.times[min(len(path), len(effect.times)) - 1]
@@ -286,9 +288,9 @@ def save_picture(
         (frames[0], sight.placed.outline(HEIGHT)),
         (frames[int(np.flatnonzero(there)[-1])], None),
     ):
-        corners = detect_markers(frame.picture, layout.dictionary).corners
+        corners = detect_markers(frame.image, layout.dictionary).corners
         # Drawn large: the paths are a few centimetres long.
-        large = cv2.resize(frame.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        large = cv2.resize(frame.image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
         drawn = draw_overlay(large, camera.scaled(2), found.T_table_camera, outline, paths, 2 * corners + 0.5)
         halves.append(drawn[: 2 * 600, 2 * 240 : 2 * 1040])
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -343,7 +345,7 @@ def main() -> None:
 def measure_films(options: argparse.Namespace) -> dict:
     """Films and stills as they are by default, and what a predictor makes of them."""
     make_films(options.films, options.num)
-    calibration = calibrate(read_pictures([options.films / "board"]), BOARD)
+    calibration = calibrate(read_images([options.films / "board"]), BOARD)
     predictor = load_predictor(options.run)
     rows, refused = [], {}
     for number in range(options.num):

@@ -1,9 +1,14 @@
 """Options of the test suite."""
 
 import os
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+if TYPE_CHECKING:
+    from foretrace.simulation.recording import RecordingTruth
 
 # Neither a deadline nor a check of how long examples take to draw: that says more about the machine than about the
 # code. Continuous integration tries the same examples every time; elsewhere new ones are searched for.
@@ -32,3 +37,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write the golden files anew, then look at the diff"
     )
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> "tuple[Path, RecordingTruth]":
+    """Folder and truth of the recorded lever-up of `recorded_scene`; not to be written to."""
+    import recorded_scene
+    from foretrace.errors import SimulationError
+
+    folder = tmp_path_factory.mktemp("recorded") / "recording"
+    try:
+        return folder, recorded_scene.record(folder)
+    except SimulationError as error:
+        pytest.skip(str(error))

@@ -13,7 +13,7 @@ import pytest
 
 from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.films import open_film
+from foretrace.perception.recordings import open_recording
 
 pytest.importorskip("rosbags")
 
@@ -24,20 +24,20 @@ BOTH = pytest.mark.parametrize("ros1", [True, False], ids=["ros1", "ros2"])
 
 @dataclass(frozen=True)
 class Said:
-    """A message to write: raw or compressed picture, or the camera."""
+    """A message to write: raw or compressed image, or the camera."""
 
     topic: str
     time: float
     data: np.ndarray | bytes
     encoding: str = "bgr8"
-    """Of a raw picture; the format of a compressed one."""
+    """Of a raw image; the format of a compressed one."""
     frame: str = "colour_frame"
     recorded: float | None = None
     """When the bag got it [s]; by default at once."""
     step: int | None = None
 
 
-def pictures(number: int, topic: str = COLOUR) -> list[Said]:
+def images(number: int, topic: str = COLOUR) -> list[Said]:
     rng = np.random.default_rng(0)
     shape = (CAMERA.height, CAMERA.width, 3)
     return [Said(topic, 5 + 0.1 * k, rng.integers(0, 255, shape, dtype=np.uint8)) for k in range(number)]
@@ -55,8 +55,8 @@ def steps_of(depth: np.ndarray) -> np.ndarray:
     return np.rint(1000 * depth).astype(np.uint16)
 
 
-def png(picture: np.ndarray) -> bytes:
-    return cv2.imencode(".png", picture)[1].tobytes()
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
 
 
 def write_bag(path: Path, said: Sequence[Said], ros1: bool, plugin: str = "mcap", infos: bool = True) -> Path:
@@ -136,25 +136,25 @@ def bag_of(folder: Path, said: Sequence[Said], ros1: bool = False, **options: An
 
 
 @BOTH
-def test_colour_pictures_and_camera(tmp_path: Path, ros1: bool) -> None:
-    said = pictures(6)
-    film = open_film(bag_of(tmp_path, said, ros1))
+def test_colour_images_and_camera(tmp_path: Path, ros1: bool) -> None:
+    said = images(6)
+    film = open_recording(bag_of(tmp_path, said, ros1))
     assert film.camera == CAMERA
     frames = list(film.frames())
     np.testing.assert_allclose([frame.time for frame in frames], [one.time for one in said], atol=1e-6)
-    np.testing.assert_array_equal(frames[2].picture, said[2].data)
+    np.testing.assert_array_equal(frames[2].image, said[2].data)
     assert all(frame.depth is None for frame in frames)
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgra8", "rgba8", "mono8"])
 def test_colours_of_every_encoding(tmp_path: Path, encoding: str) -> None:
-    picture = np.asarray(pictures(1)[0].data)
+    image = np.asarray(images(1)[0].data)
     code = {"rgb8": cv2.COLOR_BGR2RGB, "bgra8": cv2.COLOR_BGR2BGRA, "rgba8": cv2.COLOR_BGR2RGBA}
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    sent = grey if encoding == "mono8" else cv2.cvtColor(picture, code[encoding])
-    read = next(open_film(bag_of(tmp_path, [Said(COLOUR, 5.0, sent, encoding)])).frames()).picture
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    sent = grey if encoding == "mono8" else cv2.cvtColor(image, code[encoding])
+    read = next(open_recording(bag_of(tmp_path, [Said(COLOUR, 5.0, sent, encoding)])).frames()).image
     np.testing.assert_array_equal(
-        read, picture if encoding != "mono8" else np.repeat(grey[..., None], 3, axis=2)
+        read, image if encoding != "mono8" else np.repeat(grey[..., None], 3, axis=2)
     )
 
 
@@ -180,38 +180,38 @@ def test_depth(tmp_path: Path, ros1: bool, kind: str) -> None:
             "32FC1; compressedDepth",
         ),
     }[kind]
-    said = [entry for k, one in enumerate(pictures(3)) for entry in (one, sent(k))]
-    frames = list(open_film(bag_of(tmp_path, said, ros1)).frames())
+    said = [entry for k, one in enumerate(images(3)) for entry in (one, sent(k))]
+    frames = list(open_recording(bag_of(tmp_path, said, ros1)).frames())
     for frame, depth in zip(frames, depths, strict=True):
         assert frame.depth is not None
         np.testing.assert_allclose(frame.depth, depth, atol=1e-4 if kind == "inverse" else 1e-6)
         np.testing.assert_array_equal(frame.depth == 0, depth == 0)
 
 
-@pytest.mark.parametrize("picture_format", ["jpeg", "rgb8; png compressed bgr8"])
-def test_compressed_colours(tmp_path: Path, picture_format: str) -> None:
-    smooth = cv2.GaussianBlur(np.asarray(pictures(1)[0].data), (0, 0), 4)
-    ending = ".jpg" if "jpeg" in picture_format else ".png"
+@pytest.mark.parametrize("image_format", ["jpeg", "rgb8; png compressed bgr8"])
+def test_compressed_colours(tmp_path: Path, image_format: str) -> None:
+    smooth = cv2.GaussianBlur(np.asarray(images(1)[0].data), (0, 0), 4)
+    ending = ".jpg" if "jpeg" in image_format else ".png"
     data = cv2.imencode(ending, smooth)[1].tobytes()
     topic = f"{COLOUR}/compressed"
-    film = open_film(bag_of(tmp_path, [Said(topic, 5.0, data, picture_format)]))
+    film = open_recording(bag_of(tmp_path, [Said(topic, 5.0, data, image_format)]))
     assert film.camera == CAMERA
-    assert np.abs(next(film.frames()).picture.astype(int) - smooth).mean() < 3
+    assert np.abs(next(film.frames()).image.astype(int) - smooth).mean() < 3
     (tmp_path / "broken").mkdir()
-    broken = bag_of(tmp_path / "broken", [Said(topic, 5.0, data[:20], picture_format)])
+    broken = bag_of(tmp_path / "broken", [Said(topic, 5.0, data[:20], image_format)])
     with pytest.raises(PerceptionError, match="cannot be decoded"):
-        list(open_film(broken).frames())
+        list(open_recording(broken).frames())
 
 
-def test_depth_joins_the_colour_picture_nearest_in_time(tmp_path: Path) -> None:
-    """Depth at a third of the rate, a little late, one of them before its colour picture in the bag."""
+def test_depth_joins_the_colour_image_nearest_in_time(tmp_path: Path) -> None:
+    """Depth at a third of the rate, a little late, one of them before its colour image in the bag."""
     depths = depth_of(2)
     late = [
         Said(DEPTH, 5.012, steps_of(depths[0]), "16UC1"),
         Said(DEPTH, 5.295, steps_of(depths[1]), "16UC1", recorded=5.29),
     ]
-    said = sorted([*pictures(6), *late], key=lambda one: one.recorded or one.time)
-    frames = list(open_film(bag_of(tmp_path, said)).frames())
+    said = sorted([*images(6), *late], key=lambda one: one.recorded or one.time)
+    frames = list(open_recording(bag_of(tmp_path, said)).frames())
     assert [frame.depth is not None for frame in frames] == [True, False, False, True, False, False]
     assert frames[3].depth is not None
     np.testing.assert_allclose(frames[3].depth, depths[1], atol=1e-6)
@@ -221,66 +221,66 @@ def test_depth_joins_the_colour_picture_nearest_in_time(tmp_path: Path) -> None:
 def test_depth_of_another_camera_is_left_alone(tmp_path: Path) -> None:
     """Depth that is not aligned would put every pixel in the wrong place, in silence."""
     other = Said(DEPTH, 5.0, steps_of(depth_of(1)[0]), "16UC1", frame="depth_frame")
-    path = bag_of(tmp_path, [*pictures(2), other])
-    assert next(open_film(path).frames()).depth is None
+    path = bag_of(tmp_path, [*images(2), other])
+    assert next(open_recording(path).frames()).depth is None
     with pytest.raises(PerceptionError, match=r"is in frame 'depth_frame', .* in 'colour_frame'"):
-        open_film(path, depth_topic=DEPTH)
+        open_recording(path, depth_topic=DEPTH)
     with pytest.raises(PerceptionError, match=f"no depth topic /gone .* depth topics are {DEPTH}"):
-        open_film(path, depth_topic="/gone")
+        open_recording(path, depth_topic="/gone")
     (tmp_path / "two").mkdir()
     twins = [Said(name, 5.0, steps_of(depth_of(1)[0]), "16UC1") for name in ("/a", "/b")]
-    path = bag_of(tmp_path / "two", [*pictures(2), *twins])
+    path = bag_of(tmp_path / "two", [*images(2), *twins])
     with pytest.raises(PerceptionError, match="depth topics are /a, /b: name one with --depth-topic"):
-        open_film(path)
-    assert next(open_film(path, depth_topic="/b").frames()).depth is not None
+        open_recording(path)
+    assert next(open_recording(path, depth_topic="/b").frames()).depth is not None
 
 
 def test_topics_that_are_missing(tmp_path: Path) -> None:
-    path = bag_of(tmp_path, [*pictures(2), *pictures(2, "/second/image")])
+    path = bag_of(tmp_path, [*images(2), *images(2, "/second/image")])
     with pytest.raises(
         PerceptionError, match=f"image topics are {COLOUR}, /second/image: name one with --topic"
     ):
-        open_film(path)
-    assert len(list(open_film(path, "/second/image").frames())) == 2
+        open_recording(path)
+    assert len(list(open_recording(path, "/second/image").frames())) == 2
     with pytest.raises(PerceptionError, match="no image topic /gone with messages"):
-        open_film(path, "/gone")
+        open_recording(path, "/gone")
     (tmp_path / "none").mkdir()
     with pytest.raises(PerceptionError, match="it has no image topic"):
-        open_film(bag_of(tmp_path / "none", []))
+        open_recording(bag_of(tmp_path / "none", []))
 
 
 def test_time_stamps(tmp_path: Path) -> None:
     """The driver's stamps count, not the recorder's; without them the recorder's."""
-    from foretrace.perception.importing import Contact, import_film
+    from foretrace.perception.importing import Contact, import_recording
     from foretrace.perception.markers import MarkerBody, MarkerLayout
 
-    backwards = [dataclasses.replace(one, time=6 - one.time / 10, recorded=one.time) for one in pictures(3)]
+    backwards = [dataclasses.replace(one, time=6 - one.time / 10, recorded=one.time) for one in images(3)]
     layout = MarkerLayout("4x4_50", MarkerBody.single(0, 0.05), MarkerBody.single(1, 0.05))
     with pytest.raises(PerceptionError, match=r"time stamps of .* do not increase: frame 1 at"):
-        import_film(open_film(bag_of(tmp_path, backwards)), CAMERA, layout, Contact(edge=(0, 0.5)))
+        import_recording(open_recording(bag_of(tmp_path, backwards)), CAMERA, layout, Contact(edge=(0, 0.5)))
     (tmp_path / "none").mkdir()
-    unstamped = [dataclasses.replace(one, time=0.0, recorded=one.time) for one in pictures(3)]
-    frames = list(open_film(bag_of(tmp_path / "none", unstamped)).frames())
+    unstamped = [dataclasses.replace(one, time=0.0, recorded=one.time) for one in images(3)]
+    frames = list(open_recording(bag_of(tmp_path / "none", unstamped)).frames())
     np.testing.assert_allclose([frame.time for frame in frames], [5.0, 5.1, 5.2], atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap", "db3"])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_bags_that_are_cut_off(tmp_path: Path, kind: str, share: float) -> None:
-    path = bag_of(tmp_path, pictures(8), kind == "ros1", plugin=kind)
+    path = bag_of(tmp_path, images(8), kind == "ros1", plugin=kind)
     content = path if kind == "ros1" else next(path.glob(f"*.{kind}"))
     content.write_bytes(content.read_bytes()[: round(share * content.stat().st_size)])
     with pytest.raises(PerceptionError, match=r"bag .* cannot be read .*cut off"):
-        list(open_film(path).frames())
+        list(open_recording(path).frames())
 
 
 def test_bags_without_their_description(tmp_path: Path) -> None:
-    path = bag_of(tmp_path, pictures(2))
+    path = bag_of(tmp_path, images(2))
     file = next(path.glob("*.mcap"))
-    assert len(list(open_film(file).frames())) == 2
+    assert len(list(open_recording(file).frames())) == 2
     (path / "metadata.yaml").unlink()
     with pytest.raises(PerceptionError, match=r"no metadata.yaml beside it: copy the bag's whole folder"):
-        open_film(file)
+        open_recording(file)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def test_bags_without_their_description(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_pictures_that_cannot_be_read(tmp_path: Path, said: Said, reason: str) -> None:
-    others = pictures(2) if said.topic == DEPTH else []
+def test_images_that_cannot_be_read(tmp_path: Path, said: Said, reason: str) -> None:
+    others = images(2) if said.topic == DEPTH else []
     with pytest.raises(PerceptionError, match=reason):
-        list(open_film(bag_of(tmp_path, [*others, said])).frames())
+        list(open_recording(bag_of(tmp_path, [*others, said])).frames())

@@ -1,4 +1,4 @@
-"""What all exports share: the choice, the delivery, resampling, pictures."""
+"""What all exports share: the choice, the delivery, resampling, images."""
 
 import importlib
 from dataclasses import replace
@@ -14,7 +14,7 @@ from foretrace import cli
 from foretrace.errors import DatasetError, ExportError, PredictionError
 from foretrace.export.delivery import delivered
 from foretrace.export.episodes import Episode, choose
-from foretrace.export.pictures import CAMERA, camera_pose, take_pictures
+from foretrace.export.images import CAMERA, camera_pose, render_images
 from foretrace.export.resampling import frame_times, frames_per_second, resample_poses
 from foretrace.geometry import invert_transform, pose_to_matrix, transform_points
 from foretrace.imagined import ImaginedEffect
@@ -173,11 +173,11 @@ def test_a_steady_motion_is_resampled_exactly():
     np.testing.assert_allclose(pose_to_matrix(found), pose_to_matrix(motion(at)), atol=1e-12)
 
 
-def test_pictures_show_object_and_tool_where_they_are():
+def test_images_show_object_and_tool_where_they_are():
     interaction = factories.fake_interaction(np.random.default_rng(2), 2)
     effect = interaction.effect
     try:
-        seen = take_pictures(interaction, effect.pose_trajectory[::59], effect.tool_trajectory[::59])
+        seen = render_images(interaction, effect.pose_trajectory[::59], effect.tool_trajectory[::59])
     except ExportError as error:
         pytest.skip(f"cannot render here: {error}")
     np.testing.assert_allclose(np.linalg.det(camera_pose()), 1)

@@ -16,9 +16,9 @@ from export_samples import NUM_SAMPLES, fake_data, fake_run, write_data
 from foretrace import cli
 from foretrace.errors import ExportError
 from foretrace.export import lerobot
+from foretrace.export.episode_statistics import all_statistics, image_statistics, vector_statistics
 from foretrace.export.episodes import Episodes, choose
 from foretrace.export.lerobot import export_lerobot
-from foretrace.export.statistics import all_statistics, picture_statistics, vector_statistics
 from foretrace.geometry import pose_to_matrix
 from foretrace.interactions.dataset import Dataset
 from foretrace.predictor import TrainConfig, train_predictor
@@ -70,11 +70,11 @@ def test_info_describes_the_files(folder, info, table):
         "data/chunk-000/file-000.parquet",
     }
     kinds = {"float32": pa.float32(), "int64": pa.int64()}
-    picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    image = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     assert set(table.schema.names) == set(info["features"])
     for name, feature in info["features"].items():
         if feature["dtype"] == "image":
-            expected = picture
+            expected = image
         elif feature["shape"] == [1]:
             expected = kinds[feature["dtype"]]
         else:
@@ -126,9 +126,9 @@ def test_episodes_hold_what_happened_and_what_was_imagined(folder, episodes, tab
             np.array(rows["observation.joints"].to_pylist()), effect.joint_trajectory, atol=1e-6
         )
         for row in (0, -1):
-            picture = Image.open(io.BytesIO(rows["observation.images.view"][row].as_py()["bytes"]))
-            assert (picture.format, picture.mode) == ("TIFF", "F")
-            np.testing.assert_array_equal(np.array(picture), view.height)
+            image = Image.open(io.BytesIO(rows["observation.images.view"][row].as_py()["bytes"]))
+            assert (image.format, image.mode) == ("TIFF", "F")
+            np.testing.assert_array_equal(np.array(image), view.height)
 
 
 def test_episode_rows_say_where_and_how(folder, info, episodes):
@@ -168,11 +168,11 @@ def test_statistics_of_the_whole_are_those_of_all_frames(folder, info, table):
     assert np.shape(stats["observation.images.view"]["std"]) == (1, 1, 1)
 
 
-def test_statistics_of_pictures_and_quantiles():
+def test_statistics_of_images_and_quantiles():
     rng = np.random.default_rng(0)
     colours = rng.integers(0, 256, (5, 32, 16, 3), dtype=np.uint8)
     colours[..., 2] = 255
-    found = picture_statistics(colours)
+    found = image_statistics(colours)
     assert found["mean"].shape == (3, 1, 1)
     assert found["count"].tolist() == [5]
     assert found["mean"][2, 0, 0] == 1
@@ -259,7 +259,7 @@ def test_large_data_sets_are_split_into_files(episodes, tmp_path, monkeypatch):
         assert set(file["episode_index"].to_pylist()) == {k}
 
 
-def test_rendered_pictures_are_features(tmp_path):
+def test_rendered_images_are_features(tmp_path):
     data = fake_data(tmp_path / "data", 1)
     command = [
         "export",

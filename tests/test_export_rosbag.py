@@ -187,7 +187,7 @@ def test_the_view_from_above_comes_first(bag, episodes):
     np.testing.assert_array_equal(found, episodes[0].interaction.view.height)
 
 
-def test_pictures_come_with_intrinsics_and_pose(bag, episodes):
+def test_images_come_with_intrinsics_and_pose(bag, episodes):
     if "/camera/color/image_raw" not in bag:
         pytest.skip("this machine cannot render")
     count = len(episodes[0].interaction.effect.times)
@@ -218,7 +218,7 @@ def test_pictures_come_with_intrinsics_and_pose(bag, episodes):
     np.testing.assert_allclose(points[..., 2], 0, atol=1e-3)
 
 
-def test_recordings_have_no_invented_pictures(tmp_path):
+def test_recordings_have_no_invented_images(tmp_path):
     from dataclasses import replace
 
     interaction = factories.fake_interaction(np.random.default_rng(0), 5)

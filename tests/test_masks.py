@@ -14,8 +14,8 @@ from foretrace.perception.views import (
     PlacedObject,
     contact_at_pixel,
     fit_object,
+    observe,
     place_object,
-    see,
     view_of_depth,
 )
 
@@ -58,7 +58,7 @@ def share() -> np.ndarray:
     return silhouette(placed())
 
 
-def picture(share: np.ndarray, light: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def image(share: np.ndarray, light: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     table, colour = np.array([200.0, 208, 214]), np.array([150.0, 90, 20])
     slope = np.linspace(1.0, 0.85, 640)[None, :, None]
@@ -85,15 +85,15 @@ def test_a_background_of_several_colours_leaves_no_dent(share: np.ndarray) -> No
     blurred = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in (scene, background)]
     rng = np.random.default_rng(0)
     noisy = [np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for image in blurred]
-    found = masks.pick_object(masks.mask_by_background(noisy[0], noisy[1]))
+    found = masks.find_by_background(noisy[0], noisy[1]) > 0.5
     assert iou(found, share > 0.5) > 0.995
 
 
 @pytest.mark.parametrize("way", ["background", "threshold", "colour", "grabcut"])
 def test_ways_to_find_an_object(share: np.ndarray, way: str) -> None:
-    scene, background = picture(share, light=0.9)
+    scene, background = image(share, light=0.9)
     found = {
-        "background": lambda: masks.mask_by_background(scene, background),
+        "background": lambda: masks.cover_by_background(scene, background) > 0.5,
         "threshold": lambda: masks.mask_by_threshold(scene),
         "colour": lambda: masks.mask_by_colour(scene, (335.0, 235.0)),
         "grabcut": lambda: masks.mask_by_grabcut(scene, (200, 120, 260, 240)),
@@ -110,8 +110,8 @@ def test_a_mask_becomes_the_object_where_it_lies(share: np.ndarray) -> None:
     contact = 0.5 * (PRISM.corners[1] + PRISM.corners[2])
     rim = placed().T_table_object @ [*contact, PRISM.height, 1.0]
     pixel = CAMERA.project(rim[None, :3], invert_transform(camera_pose()))[0]
-    sight = see(seen, contact_at_pixel(seen, (pixel[0], pixel[1]), CAMERA, camera_pose()))
-    exact = see(placed(), contact)
+    sight = observe(seen, contact_at_pixel(seen, (pixel[0], pixel[1]), CAMERA, camera_pose()))
+    exact = observe(placed(), contact)
     assert iou(sight.view.mask, exact.view.mask) > 0.98
     np.testing.assert_allclose(sight.com_in_action, exact.com_in_action, atol=0.001)
     np.testing.assert_allclose(sight.T_table_action, exact.T_table_action, atol=0.01)
@@ -125,7 +125,7 @@ def test_without_parallax_undone_the_object_would_be_too_large(share: np.ndarray
         )
 
 
-def depth_picture() -> np.ndarray:
+def depth_image() -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(320), np.arange(240))
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1).astype(float)
     T = camera_pose()
@@ -140,7 +140,7 @@ def depth_picture() -> np.ndarray:
 
 
 def test_depth_tells_table_object_and_height() -> None:
-    depth = depth_picture()
+    depth = depth_image()
     depth[::7, ::5] = 0.0
     table = masks.find_table(depth, DEPTH_CAMERA)
     T = camera_pose()
@@ -149,9 +149,9 @@ def test_depth_tells_table_object_and_height() -> None:
     normal = table.T_table_camera[:3, :3].T[:, 2]
     assert np.arccos(normal @ T[:3, :3].T[:, 2]) < np.deg2rad(0.3)
     heights = masks.heights_above_table(depth, DEPTH_CAMERA, T)
-    mask = masks.pick_object(masks.mask_by_height(heights))
+    mask = masks.find_by_height(heights)
     assert masks.object_height(heights, mask) == pytest.approx(PRISM.height, abs=0.001)
-    exact = see(placed(), 0.5 * (PRISM.corners[1] + PRISM.corners[2]))
+    exact = observe(placed(), 0.5 * (PRISM.corners[1] + PRISM.corners[2]))
     view = view_of_depth(depth, mask, DEPTH_CAMERA, invert_transform(exact.T_table_action) @ T)
     assert isinstance(view, TopDownView)
     assert view.height[view.mask].max() == pytest.approx(PRISM.height, abs=0.004)
@@ -159,12 +159,12 @@ def test_depth_tells_table_object_and_height() -> None:
 
 
 def test_bad_input_is_refused_with_a_reason(share: np.ndarray) -> None:
-    scene, background = picture(share)
+    scene, background = image(share)
     mask = share >= 0.5
     with pytest.raises(PerceptionError, match="take both with one camera"):
-        masks.mask_by_background(scene, background[:100])
+        masks.cover_by_background(scene, background[:100])
     with pytest.raises(PerceptionError, match="was the camera moved"):
-        masks.mask_by_background(
+        masks.cover_by_background(
             np.random.default_rng(0).integers(0, 255, scene.shape).astype(np.uint8), background
         )
     with pytest.raises(PerceptionError, match="the mask is empty"):
@@ -173,13 +173,13 @@ def test_bad_input_is_refused_with_a_reason(share: np.ndarray) -> None:
         masks.pick_object(np.roll(mask, 250, axis=1) & (np.arange(640) > 300))
     with pytest.raises(PerceptionError, match="pixels from the nearest of 1 objects"):
         masks.pick_object(mask, (20.0, 20.0))
-    with pytest.raises(PerceptionError, match="lies outside a picture of 640 x 480"):
+    with pytest.raises(PerceptionError, match="lies outside an image of 640 x 480"):
         masks.mask_by_colour(scene, (700.0, 20.0))
     with pytest.raises(PerceptionError, match=r"point \(nan, 20\) is no pixel"):
         masks.pick_object(mask, (float("nan"), 20.0))
     with pytest.raises(PerceptionError, match="give left, top, width and height"):
         masks.mask_by_grabcut(scene, (600, 10, 100, 100))
-    with pytest.raises(PerceptionError, match="the depth picture is empty"):
+    with pytest.raises(PerceptionError, match="the depth image is empty"):
         masks.find_table(np.zeros((480, 640)), CAMERA)
     with pytest.raises(PerceptionError, match="was calibrated for 640 x 480"):
         masks.find_table(np.ones((240, 320)), CAMERA)
@@ -188,7 +188,7 @@ def test_bad_input_is_refused_with_a_reason(share: np.ndarray) -> None:
     with pytest.raises(PerceptionError, match="check both"):
         place_object(mask, CAMERA, camera_pose(), 0.9)
     with pytest.raises(PerceptionError, match="from the object's outline"):
-        see(placed(), np.array([0.2, 0.2]))
+        observe(placed(), np.array([0.2, 0.2]))
     seen = place_object(mask, CAMERA, camera_pose(), PRISM.height)
     with pytest.raises(PerceptionError, match="overlaps the given object's"):
         fit_object(seen, Prism(0.5 * PRISM.corners))

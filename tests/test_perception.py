@@ -3,6 +3,7 @@
 import itertools
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,7 @@ from foretrace.perception.markers import (
     align_patterns,
     detect_markers,
     fitting_dictionaries,
-    picture_fault,
+    image_fault,
     square,
 )
 from foretrace.perception.overlay import PREDICTED, draw_overlay
@@ -40,7 +41,7 @@ def looking_at(tilt: float, turn: float, distance: float, spin: float = 0.3) -> 
     return T
 
 
-def picture_of(
+def image_of(
     texture: np.ndarray, size: tuple[float, float], T: np.ndarray, camera: PinholeCamera
 ) -> np.ndarray:
     """What a camera sees of a flat print whose frame has its origin in the lower left corner: exact per pixel."""
@@ -51,20 +52,20 @@ def picture_of(
     where = (points * scale + [0.0, texture.shape[0]] - 0.5).astype(np.float32)
     where = where.reshape(*columns.shape, 2)
     seen = cv2.remap(texture, where[..., 0], where[..., 1], cv2.INTER_AREA, borderValue=200)
-    picture = cv2.resize(seen, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 0.6), cv2.COLOR_GRAY2BGR)
+    image = cv2.resize(seen, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 0.6), cv2.COLOR_GRAY2BGR)
 
 
-def board_pictures(num: int, board: Board = BOARD) -> dict[str, np.ndarray]:
+def board_images(num: int, board: Board = BOARD) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
     texture = np.pad(board.draw(6000.0), 60, constant_values=255)
     size = (board.size[0] + 0.02, board.size[1] + 0.02)
-    pictures = {}
+    images = {}
     for k in range(num):
         T = looking_at(*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.22, 0.3))
         T[:3, 3] -= T[:3, :3] @ [size[0] / 2, size[1] / 2, 0.0]
-        pictures[f"picture {k}"] = picture_of(texture, size, T, CAMERA)
-    return pictures
+        images[f"image {k}"] = image_of(texture, size, T, CAMERA)
+    return images
 
 
 def marker_scene(
@@ -79,12 +80,12 @@ def marker_scene(
     size = side * (modules + 2) / modules
     corner = np.eye(4)
     corner[:2, 3] = -size / 2
-    return picture_of(texture, (size, size), T @ corner, camera)
+    return image_of(texture, (size, size), T @ corner, camera)
 
 
 @pytest.fixture(scope="module")
-def pictures() -> dict[str, np.ndarray]:
-    return board_pictures(8)
+def images() -> dict[str, np.ndarray]:
+    return board_images(8)
 
 
 def test_pixels_and_rays_agree_with_distortion() -> None:
@@ -123,10 +124,10 @@ def test_camera_files(tmp_path: Path) -> None:
         PinholeCamera.load(tmp_path / "none.json")
 
 
-def test_calibration_finds_the_camera(pictures: dict[str, np.ndarray]) -> None:
-    found = calibrate(pictures, BOARD)
+def test_calibration_finds_the_camera(images: dict[str, np.ndarray]) -> None:
+    found = calibrate(images, BOARD)
     assert found.error < 0.15
-    assert set(found.errors) == set(pictures)
+    assert set(found.errors) == set(images)
     # Two cameras are alike if they see along the same lines.
     pixels = np.stack(np.meshgrid([60.0, 320.0, 580.0], [60.0, 240.0, 420.0]), axis=-1).reshape(-1, 2)
     apart = np.linalg.norm(found.camera.project(CAMERA.rays(pixels), np.eye(4)) - pixels, axis=1)
@@ -134,48 +135,48 @@ def test_calibration_finds_the_camera(pictures: dict[str, np.ndarray]) -> None:
     assert found.camera.fx == pytest.approx(CAMERA.fx, rel=0.005)
 
 
-def test_camera_pose_over_the_board(pictures: dict[str, np.ndarray]) -> None:
+def test_camera_pose_over_the_board(images: dict[str, np.ndarray]) -> None:
     margin = 0.01
     T = looking_at(0.5, 0.1, 0.4)
     size = (BOARD.size[0] + 2 * margin, BOARD.size[1] + 2 * margin)
-    picture = picture_of(np.pad(BOARD.draw(6000.0), 60, constant_values=255), size, T, CAMERA)
+    image = image_of(np.pad(BOARD.draw(6000.0), 60, constant_values=255), size, T, CAMERA)
     shift = np.eye(4)
     shift[:2, 3] = margin
     truth = invert_transform(T @ shift)
-    found = BOARD.pose(picture, CAMERA)
+    found = BOARD.pose(image, CAMERA)
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 0.001
     assert rotation_angle(found[:3, :3], truth[:3, :3]) < np.deg2rad(0.2)
     with pytest.raises(PerceptionError, match="was calibrated for 640 x 480"):
-        BOARD.pose(picture[:400], CAMERA)
+        BOARD.pose(image[:400], CAMERA)
 
 
-def test_calibration_refuses_what_it_cannot_use(pictures: dict[str, np.ndarray]) -> None:
-    few = dict(list(pictures.items())[:3])
-    with pytest.raises(PerceptionError, match="3 of 3 pictures show the board, 5 are needed"):
+def test_calibration_refuses_what_it_cannot_use(images: dict[str, np.ndarray]) -> None:
+    few = dict(list(images.items())[:3])
+    with pytest.raises(PerceptionError, match="3 of 3 images show the board, 5 are needed"):
         calibrate(few, BOARD)
     with pytest.raises(PerceptionError, match="its markers are of 4x4_50, not 6x6_50"):
-        calibrate(pictures, Board((6, 5), 0.03, 0.022, "6x6_50"))
+        calibrate(images, Board((6, 5), 0.03, 0.022, "6x6_50"))
     with pytest.raises(PerceptionError, match="odd has 320 x 240 pixels"):
-        calibrate(pictures | {"odd": np.zeros((240, 320, 3), np.uint8)}, BOARD)
-    dark = {f"dark {k}": (picture * 0.05).astype(np.uint8) for k, picture in enumerate(pictures.values())}
+        calibrate(images | {"odd": np.zeros((240, 320, 3), np.uint8)}, BOARD)
+    dark = {f"dark {k}": (image * 0.05).astype(np.uint8) for k, image in enumerate(images.values())}
     with pytest.raises(PerceptionError, match="it is dark"):
         calibrate(dark, BOARD)
     rows, columns = np.indices((480, 640), dtype=np.float32)
     waves = 4 * np.sin(rows / 20)
-    wavy = {name: cv2.remap(picture, columns + waves, rows, 1) for name, picture in pictures.items()}
-    with pytest.raises(PerceptionError, match="no camera explains the pictures"):
+    wavy = {name: cv2.remap(image, columns + waves, rows, 1) for name, image in images.items()}
+    with pytest.raises(PerceptionError, match="no camera explains the images"):
         calibrate(wavy, BOARD)
 
 
 def test_calibrate_command(
-    tmp_path: Path, pictures: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, images: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, picture in pictures.items():
-        cv2.imwrite(str(tmp_path / f"{name}.png"), picture)
+    for name, image in images.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
     options = ["--squares", "6", "5", "--square-length", "0.03", "--marker-length", "0.022"]
     options += ["--dictionary", "4x4_50"]
     assert main(["calibrate", str(tmp_path), *options, "--out", str(tmp_path / "c.json")]) == 0
-    assert "over 8 pictures" in capsys.readouterr().out
+    assert "over 8 images" in capsys.readouterr().out
     assert PinholeCamera.load(tmp_path / "c.json").fx == pytest.approx(600, rel=0.01)
     assert main(["calibrate", "--print-board", str(tmp_path / "b.png"), *options]) == 0
     assert "180.0 x 150.0 mm" in capsys.readouterr().out
@@ -184,21 +185,42 @@ def test_calibrate_command(
     assert main(["calibrate", "--print-board", str(tmp_path / "b.pdf"), *options]) == 0
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
     assert main(["calibrate", str(tmp_path / "nothing.png")]) == 2
-    assert "cannot read a picture" in capsys.readouterr().err
+    assert "cannot read an image" in capsys.readouterr().err
+
+
+def test_the_command_refines_a_camera_by_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, slant in enumerate(np.linspace(0.4, 0.9, 6)):
+        T = looking_at(*(slant * np.array([np.cos(2.0 * k), np.sin(2.0 * k)])), 0.3)
+        cv2.imwrite(str(folder / f"{k}.png"), marker_scene("apriltag_36h11", 7, 0.08, T))
+    stated, layout, out = (tmp_path / f"{name}.json" for name in ("stated", "markers", "refined"))
+    replace(CAMERA, fx=0.96 * CAMERA.fx, fy=0.96 * CAMERA.fy).save(stated)
+    marker = {"id": 7, "side": 0.08}
+    content = {"format": "foretrace-markers", "version": 1, "dictionary": "apriltag_36h11"}
+    layout.write_text(json.dumps(content | {"table": [marker], "object": [{"id": 8, "side": 0.04}]}))
+    command = ["calibrate", str(folder), "--refine", str(stated), "--out", str(out)]
+    assert main(command) == 2
+    assert "--markers LAYOUT go together" in capsys.readouterr().err
+    assert main([*command, "--markers", str(layout)]) == 0
+    assert "over 6 images" in capsys.readouterr().out
+    refined = PinholeCamera.load(out)
+    assert refined.fx == pytest.approx(CAMERA.fx, rel=0.01)
+    assert refined.fy == pytest.approx(CAMERA.fy, rel=0.01)
 
 
 @pytest.mark.parametrize("name", ["5x5_100", "apriltag_36h11"])
 def test_a_marker_tells_its_pose(name: str) -> None:
     T = looking_at(0.6, 0.4, 0.35)
-    picture = marker_scene(name, 7, 0.06, T)
-    found = align_patterns(picture, detect_markers(picture, name), name)
+    image = marker_scene(name, 7, 0.06, T)
+    found = align_patterns(image, detect_markers(image, name), name)
     assert found.ids.tolist() == [7]
     np.testing.assert_allclose(found.corners[0], CAMERA.project(square(0.06), T), atol=0.15)
     best, other = MarkerBody.single(7, 0.06).poses(found, CAMERA)
     assert np.linalg.norm(best.T_camera_body[:3, 3] - T[:3, 3]) < 0.001
     assert rotation_angle(best.T_camera_body[:3, :3], T[:3, :3]) < np.deg2rad(0.6)
     assert best.error < 0.1 < other.error
-    assert fitting_dictionaries(picture)[0].startswith(name.split("_")[0])
+    assert fitting_dictionaries(image)[0].startswith(name.split("_")[0])
 
 
 def test_several_markers_of_one_body_tell_more_than_one() -> None:
@@ -213,13 +235,13 @@ def test_several_markers_of_one_body_tell_more_than_one() -> None:
     assert body.poses(Detections(np.array([5]), corners[:1]), CAMERA) == []
 
 
-def test_what_is_wrong_with_a_picture() -> None:
-    picture = marker_scene("5x5_100", 7, 0.06, looking_at(0.3, 0.2, 0.3))
-    assert picture_fault(picture) == ""
-    assert "dark" in picture_fault(picture // 20)
-    assert "blurred" in picture_fault(cv2.GaussianBlur(picture, (0, 0), 15))
+def test_what_is_wrong_with_a_image() -> None:
+    image = marker_scene("5x5_100", 7, 0.06, looking_at(0.3, 0.2, 0.3))
+    assert image_fault(image) == ""
+    assert "dark" in image_fault(image // 20)
+    assert "blurred" in image_fault(cv2.GaussianBlur(image, (0, 0), 15))
     with pytest.raises(PerceptionError, match="'9x9' is unknown: choose one of 4x4_50"):
-        detect_markers(picture, "9x9")
+        detect_markers(image, "9x9")
 
 
 def test_marker_layouts(tmp_path: Path) -> None:
@@ -235,7 +257,7 @@ def test_marker_layouts(tmp_path: Path) -> None:
         ({"object": [{"id": 60, "side": 0.03}]}, "from 0 to 49"),
         ({"object": [{"id": 4, "side": 40}]}, "between 0.001 and 1 m"),
         ({"object": [{"id": 4}]}, "side"),
-        ({"version": 3}, "no marker layout"),
+        ({"version": 3}, "has format version 3"),
     ):
         path.write_text(json.dumps(good | change))
         with pytest.raises(PerceptionError, match=message):
@@ -250,10 +272,10 @@ def stand() -> dict[int, Detections]:
     """The marker in photographs of a rotary stand, by its angle [degree]."""
     if not SHARED.is_dir():
         pytest.skip(f"the photographs are not at {SHARED}")
-    pictures = {angle: cv2.imread(str(SHARED / f"rotary_{angle}.png")) for angle in ANGLES}
+    images = {angle: cv2.imread(str(SHARED / f"rotary_{angle}.png")) for angle in ANGLES}
     return {
-        angle: align_patterns(picture, detect_markers(picture, "apriltag_36h11"), "apriltag_36h11")
-        for angle, picture in pictures.items()
+        angle: align_patterns(image, detect_markers(image, "apriltag_36h11"), "apriltag_36h11")
+        for angle, image in images.items()
     }
 
 
@@ -295,7 +317,7 @@ def test_a_camera_is_refined_from_markers() -> None:
     assert error < 0.15
     np.testing.assert_allclose([camera.fx, camera.fy], [true.fx, true.fy], rtol=0.01)
     assert camera.distortion[0] == pytest.approx(-0.12, abs=0.04)
-    with pytest.raises(PerceptionError, match="are in 3 pictures, 5 are needed"):
+    with pytest.raises(PerceptionError, match="are in 3 images, 5 are needed"):
         refine_camera(seen[:3], body, stated)
     body, flat = looks(true, [0.01] * 6)
     with pytest.raises(PerceptionError, match="leave the focal length open: slant them more"):
@@ -309,7 +331,7 @@ def test_an_uncertain_path_is_drawn_as_a_tube() -> None:
     paths = {"predicted": (path, PREDICTED)}
     bare = draw_overlay(grey, camera, np.eye(4), paths=paths)
     drawn = draw_overlay(grey, camera, np.eye(4), paths=paths, radii={"predicted": radius})
-    column = lambda picture, x: np.flatnonzero((picture[40:, round(159.5 + 400 * x)] != 128).any(axis=1))  # noqa: E731
+    column = lambda image, x: np.flatnonzero((image[40:, round(159.5 + 400 * x)] != 128).any(axis=1))  # noqa: E731
     assert np.ptp(column(bare, 0.1)) < 6
     assert np.ptp(column(drawn, 0.1)) == pytest.approx(2 * 200 * 0.05 / 0.5, abs=3)
     assert np.ptp(column(drawn, -0.1)) == pytest.approx(2 * 200 * 0.01 / 0.5, abs=3)

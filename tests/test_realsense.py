@@ -13,7 +13,7 @@ from foretrace.cli import main
 from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.perception import realsense
-from foretrace.perception.films import open_film
+from foretrace.perception.recordings import open_recording
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 24
 LENS = (0.05, -0.1, 0.001, -0.001, 0.02)
@@ -23,10 +23,10 @@ START = 1000.0
 
 
 def colour_of(number: int) -> np.ndarray:
-    picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    picture[...] = [5, 9 * number, 200]
-    picture[:, number : number + 4] = 255
-    return picture
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[...] = [5, 9 * number, 200]
+    image[:, number : number + 4] = 255
+    return image
 
 
 def record(path: Path, depth: bool = True, colour: bool = True, model: str = "brown_conrady") -> Path:
@@ -101,12 +101,12 @@ def close_to(camera: PinholeCamera | None) -> bool:
 
 
 def test_a_recording_is_a_film(recording: Path) -> None:
-    film = open_film(recording)
+    film = open_recording(recording)
     assert close_to(film.camera)
     frames = list(film.frames())
     np.testing.assert_allclose([one.time for one in frames], 1 + np.arange(FRAMES) / 30, atol=1e-6)
     for number, frame in enumerate(frames):
-        np.testing.assert_array_equal(frame.picture, colour_of(number))
+        np.testing.assert_array_equal(frame.image, colour_of(number))
         assert frame.depth is not None
         seen = frame.depth[frame.depth > 0]
         assert len(seen) > 0.8 * frame.depth.size
@@ -115,16 +115,16 @@ def test_a_recording_is_a_film(recording: Path) -> None:
 
 
 def test_recordings_that_lack_something(tmp_path: Path, recording: Path) -> None:
-    frames = list(open_film(record(tmp_path / "flat.db3", depth=False)).frames())
+    frames = list(open_recording(record(tmp_path / "flat.db3", depth=False)).frames())
     assert len(frames) == FRAMES
     assert all(frame.depth is None for frame in frames)
     with pytest.raises(PerceptionError, match="has no colour stream"):
-        open_film(record(tmp_path / "grey.db3", colour=False))
-    assert open_film(record(tmp_path / "inverse.db3", model="inverse_brown_conrady")).camera is None
+        open_recording(record(tmp_path / "grey.db3", colour=False))
+    assert open_recording(record(tmp_path / "inverse.db3", model="inverse_brown_conrady")).camera is None
     content = recording.read_bytes()
     (tmp_path / "half.db3").write_bytes(content[: len(content) // 2])
     with pytest.raises(PerceptionError, match=r"half.db3 cannot be read .* it is cut off"):
-        open_film(tmp_path / "half.db3")
+        open_recording(tmp_path / "half.db3")
 
 
 def test_without_the_library(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +136,7 @@ def test_without_the_library(recording: Path, monkeypatch: pytest.MonkeyPatch) -
         return load(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", missing)
-    for attempt in (lambda: open_film(recording), realsense.LiveCamera):
+    for attempt in (lambda: open_recording(recording), realsense.LiveCamera):
         with pytest.raises(PerceptionError, match=r"pip install foretrace\[realsense\]"):
             attempt()
 
@@ -190,7 +190,7 @@ def test_filming(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = capsys.readouterr()
     assert "lost" in said.out
     assert "maker's calibration" in said.err
-    film = open_film(out)
+    film = open_recording(out)
     assert close_to(film.camera)
     assert film.background() is not None
     frames = list(film.frames())
@@ -226,7 +226,7 @@ def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rs, "context", Connected)
     with (
         realsense.LiveCamera() as camera,
-        pytest.raises(PerceptionError, match=r"gives no pictures .*arrive within 5000.*plug it in again"),
+        pytest.raises(PerceptionError, match=r"gives no images .*arrive within 5000.*plug it in again"),
     ):
         next(camera.frames(lambda _: False))
     with pytest.raises(PerceptionError, match="frames_per_second = 0, it must be at least 1"):

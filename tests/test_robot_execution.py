@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from foretrace.errors import RobotError
-from foretrace.interactions.film_folder import FilmNotes
+from foretrace.interactions.recording_folder import RecordingNotes
 from foretrace.robot.checks import ArmLimits
-from foretrace.robot.execution import SETTLE, Recording, WatchConfig, execute
-from foretrace.robot.filming import Filming
+from foretrace.robot.execution import SETTLE, MotionLog, WatchConfig, execute
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath
+from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD
 from foretrace.simulation.tool import Tool
 from ur_controller import RunningController
@@ -31,6 +31,10 @@ LEG = ArmPath("lever-up", START + np.linspace(0, 0.2, NUM)[:, None] * np.array([
 PATIENT, WATCH = WatchConfig(timeout=1.5), WatchConfig(timeout=0.5)
 """Longer than the default: the tests' machine may be busy."""
 BACK = ArmPath("set-down", LEG.joints[::-1])
+BRIEF = 30
+STEP = ArmPath("lever-up", LEG.joints[:BRIEF])
+STEP_BACK = ArmPath("set-down", STEP.joints[::-1])
+"""Long enough for everything that goes well."""
 HALF = 30
 
 
@@ -65,44 +69,52 @@ def test_a_lever_up_is_executed(kinematics, recording):
     seen = []
     away = START + np.array([0, 0, 0.004, 0, 0, 0])
     with RunningController(away) as controller:
-        go(controller.host, kinematics, recording, lambda checks: bool(seen.append(checks)) or True)
+        go(
+            controller.host,
+            kinematics,
+            recording,
+            lambda checks: bool(seen.append(checks)) or True,
+            legs=(STEP,),
+        )
     facts, rows = controller.facts, read(recording)
     assert {check.leg for check in seen[0]} == {"approach"}
     assert facts.uploads == 1
     assert facts.stops == ["servo", "program"]
-    np.testing.assert_allclose(facts.joints, LEG.joints[-1], atol=1e-4)
+    np.testing.assert_allclose(facts.joints, STEP.joints[-1], atol=1e-4)
     # Every set point arrives, in order.
     hold = round(SETTLE / CONTROL_PERIOD)
-    np.testing.assert_allclose(facts.set_points[-NUM - hold : -hold], LEG.joints, atol=1e-12)
+    np.testing.assert_allclose(facts.set_points[-BRIEF - hold : -hold], STEP.joints, atol=1e-12)
     np.testing.assert_allclose(facts.set_points[0], away, atol=1e-12)
     assert len(rows) == len(facts.set_points)
     assert {row["leg"] for row in rows} == {"approach", "lever-up", "hold"}
     assert np.all(np.diff([float(row["time_s"]) for row in rows]) >= 0)
     last = [float(rows[-1][name]) for name in rows[-1] if name.endswith(("pan_rad", "wrist_1_rad"))]
-    np.testing.assert_allclose(last, LEG.joints[-1, [0, 3]], atol=1e-3)
+    np.testing.assert_allclose(last, STEP.joints[-1, [0, 3]], atol=1e-3)
     assert {(row["robot_mode"], row["safety_mode"]) for row in rows} == {("7", "1")}
 
 
 def test_the_way_back_follows_and_is_recorded(kinematics, recording):
     with RunningController(START) as controller:
-        go(controller.host, kinematics, recording, legs=(LEG, BACK))
+        go(controller.host, kinematics, recording, legs=(STEP, STEP_BACK))
     hold = round(SETTLE / CONTROL_PERIOD)
-    np.testing.assert_allclose(controller.facts.set_points[-NUM - hold : -hold], BACK.joints, atol=1e-12)
+    np.testing.assert_allclose(
+        controller.facts.set_points[-BRIEF - hold : -hold], STEP_BACK.joints, atol=1e-12
+    )
     np.testing.assert_allclose(controller.facts.joints, START, atol=1e-4)
     legs = [row["leg"] for row in read(recording)]
     assert list(dict.fromkeys(legs)) == ["approach", "lever-up", "set-down", "hold"]
-    assert legs.count("set-down") == NUM
+    assert legs.count("set-down") == BRIEF
 
 
 class PacedCamera:
-    """A video file that gives its pictures at the pace of a camera, over and over."""
+    """A video file that gives its images at the pace of a camera, over and over."""
 
     def __init__(self, file: Path) -> None:
-        self._picture = cv2.VideoCapture(str(file)).read()[1]
+        self._image = cv2.VideoCapture(str(file)).read()[1]
 
     def read(self) -> tuple[bool, np.ndarray]:
         time.sleep(1 / 30)
-        return True, self._picture
+        return True, self._image
 
     def release(self) -> None:
         pass
@@ -120,10 +132,10 @@ def video(tmp_path) -> Path:
 
 def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording, video, monkeypatch):
     folder = recording.parent / "film"
-    film = Filming(str(video), folder)
+    film = VideoRecorder(str(video), folder)
     monkeypatch.setattr(film, "_capture", PacedCamera(video))
     with RunningController(START) as controller:
-        go(controller.host, kinematics, recording, film=film, legs=(LEG, BACK))
+        go(controller.host, kinematics, recording, film=film, legs=(STEP, STEP_BACK))
     with (folder / "timestamps.csv").open(newline="") as file:
         frames = list(csv.DictReader(file))
     times, rows = [float(frame["time_s"]) for frame in frames], read(recording)
@@ -134,20 +146,23 @@ def test_a_motion_is_filmed_on_the_clock_of_its_recording(kinematics, recording,
     last, first = (
         [float(row["host_s"]) for row in rows if row["leg"] == leg] for leg in ("approach", "lever-up")
     )
-    start = FilmNotes.load(folder).action_start
+    start = RecordingNotes.load(folder).action_start
     assert start is not None
     assert last[-1] - 1e-4 < start < first[0] + 1e-4
 
 
 def test_a_camera_that_ends_early_is_told(video, tmp_path):
-    with pytest.warns(UserWarning, match="no more pictures"), Filming(str(video), tmp_path / "film") as film:
+    with (
+        pytest.warns(UserWarning, match="no more images"),
+        VideoRecorder(str(video), tmp_path / "film") as film,
+    ):
         film._thread.join(60)
     assert len((tmp_path / "film" / "timestamps.csv").read_text().splitlines()) == 2
 
 
 def test_a_camera_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(RobotError, match=r"camera \S+none\.avi gives no picture"):
-        Filming(str(tmp_path / "none.avi"), tmp_path / "film")
+    with pytest.raises(RobotError, match=r"camera \S+none\.avi gives no image"):
+        VideoRecorder(str(tmp_path / "none.avi"), tmp_path / "film")
 
 
 @pytest.mark.parametrize(
@@ -212,5 +227,5 @@ def test_a_controller_that_is_not_there_is_named(kinematics, recording):
 def test_an_older_recording_is_not_overwritten(recording):
     recording.write_text("mine")
     with pytest.raises(RobotError, match="is there already"):
-        Recording(recording)
+        MotionLog(recording)
     assert recording.read_text() == "mine"

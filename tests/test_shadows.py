@@ -1,4 +1,4 @@
-"""Shadows are told from objects, or the picture is refused."""
+"""Shadows are told from objects, or the image is refused."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from foretrace.errors import PerceptionError, SimulationError
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.objects import Prism
 from foretrace.perception import masks
-from foretrace.simulation.film import FilmConfig, film_lever_up
 from foretrace.simulation.lens import Faults
+from foretrace.simulation.recording import RecordingConfig, record_lever_up
 from foretrace.simulation.stage import table_pattern
 
 TABLE = np.array([200.0, 208, 214])
@@ -41,7 +41,7 @@ def pattern(kind: str) -> np.ndarray:
 def photograph(
     table: np.ndarray, colour: np.ndarray, shadow: np.ndarray = SHADOW, marker: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Picture and background."""
+    """Image and background."""
     lit = table * (1 - shadow * (1 - LAMP))
     scene = lit * (1 - THING) + colour * THING
     scene = scene * (1 - MARKER) if marker else scene
@@ -58,7 +58,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 def test_a_shadow_is_no_object(kind: str) -> None:
     table = pattern(kind)
     truth = THING[..., 0] > 0.5
-    found = masks.pick_object(masks.mask_by_background(*photograph(table, BLUE)))
+    found = masks.find_by_background(*photograph(table, BLUE)) > 0.5
     assert iou(found, truth) > 0.99
     # All that differs: what the object was taken for before shadows were told from it.
     assert iou(truth | (SHADOW[..., 0] > 0.5), truth) < 0.9
@@ -67,54 +67,54 @@ def test_a_shadow_is_no_object(kind: str) -> None:
 def test_a_thin_shadow_does_not_shift_the_outline() -> None:
     """Beside the object no pixel shows shadow alone."""
     thin = np.roll(THING, (3, 2), axis=(0, 1))
-    picture, background = photograph(pattern("plain"), BLUE, thin)
-    found = masks.pick_object(masks.mask_by_background(picture, background))
+    image, background = photograph(pattern("plain"), BLUE, thin)
+    found = masks.find_by_background(image, background) > 0.5
     assert iou(found, THING[..., 0] > 0.5) > 0.99
 
 
 def test_without_a_shadow_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     for colour in (BLUE, np.array([30.0, 30, 30]), np.array([255.0, 255, 255])):
-        picture, background = photograph(pattern("plain"), colour, np.zeros_like(SHADOW))
-        seen = masks.cover_by_background(picture, background)
+        image, background = photograph(pattern("plain"), colour, np.zeros_like(SHADOW))
+        seen = masks.cover_by_background(image, background)
         with monkeypatch.context() as patch:
             patch.setattr(masks, "find_shadow", lambda *_: None)
-            np.testing.assert_array_equal(seen, masks.cover_by_background(picture, background))
+            np.testing.assert_array_equal(seen, masks.cover_by_background(image, background))
 
 
 @pytest.mark.parametrize("marker", [True, False])
 def test_what_may_be_shadow_or_object_is_refused(marker: bool) -> None:
-    picture, background = photograph(pattern("plain"), GREY, marker=marker)
+    image, background = photograph(pattern("plain"), GREY, marker=marker)
     with pytest.raises(PerceptionError, match="find the object by depth"):
-        masks.cover_by_background(picture, background)
+        masks.cover_by_background(image, background)
 
 
 def test_who_has_no_shadows_says_so() -> None:
-    picture, background = photograph(pattern("plain"), GREY, np.zeros_like(SHADOW))
+    image, background = photograph(pattern("plain"), GREY, np.zeros_like(SHADOW))
     with pytest.raises(PerceptionError, match="say --no-shadows"):
-        masks.cover_by_background(picture, background)
-    found = masks.pick_object(masks.cover_by_background(picture, background, shadows=False) > 0.5)
+        masks.cover_by_background(image, background)
+    found = masks.pick_object(masks.cover_by_background(image, background, shadows=False) > 0.5)
     assert iou(found, THING[..., 0] > 0.5) > 0.99
 
 
 def test_white_objects_are_refused_with_shadows_alone() -> None:
     """Their sides may be as dark as a shadow."""
     table = 0.7 * pattern("plain")
-    picture, background = photograph(table, TABLE, marker=False)
+    image, background = photograph(table, TABLE, marker=False)
     with pytest.raises(PerceptionError, match="lay a sheet of another colour on the table"):
-        masks.cover_by_background(picture, background)
-    picture, background = photograph(table, TABLE, np.zeros_like(SHADOW), marker=False)
-    assert iou(masks.mask_by_background(picture, background), THING[..., 0] > 0.5) > 0.98
+        masks.cover_by_background(image, background)
+    image, background = photograph(table, TABLE, np.zeros_like(SHADOW), marker=False)
+    assert iou(masks.cover_by_background(image, background) > 0.5, THING[..., 0] > 0.5) > 0.98
 
 
 def test_an_object_that_hides_the_tables_pattern_is_no_shadow() -> None:
     table = pattern("speckled")
     mean = 0.65 * table.mean(axis=(0, 1))
-    picture, background = photograph(table, mean, np.zeros_like(SHADOW), marker=False)
-    found = masks.pick_object(masks.mask_by_background(picture, background))
+    image, background = photograph(table, mean, np.zeros_like(SHADOW), marker=False)
+    found = masks.find_by_background(image, background) > 0.5
     assert iou(found, THING[..., 0] > 0.5) > 0.98
-    picture, background = photograph(table, mean, marker=False)
+    image, background = photograph(table, mean, marker=False)
     with pytest.raises(PerceptionError, match="cannot be told apart"):
-        masks.cover_by_background(picture, background)
+        masks.cover_by_background(image, background)
 
 
 CAMERA = PinholeCamera(480, 270, 345.0, 345.0, 240.0, 135.0)
@@ -122,28 +122,28 @@ PRISM = Prism([(0.09, -0.02), (0.05, 0.07), (-0.03, 0.08), (-0.09, 0.0), (-0.02,
 
 
 def film_first_frame(folder: Path, shadows: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Picture and background."""
-    usual = FilmConfig()
+    """Image and background."""
+    usual = RecordingConfig()
     short = 1.5 / usual.frames_per_second - usual.lead_time - usual.simulation.path.duration
     faults = Faults(0.0, 0.0, 0.0)
-    config = FilmConfig(
+    config = RecordingConfig(
         CAMERA, exposures=1, depth_every=0, tail_time=short, faults=faults, shadows=shadows, table="wooden"
     )
     try:
-        film_lever_up(PRISM, LeverUp.at_edge(PRISM, 2, 0.5), folder, config, seed=3)
+        record_lever_up(PRISM, LeverUp.at_edge(PRISM, 2, 0.5), folder, config, seed=3)
     except SimulationError as error:
         pytest.skip(str(error))
-    picture, background = (cv2.imread(str(folder / name)) for name in ("colour-00000.jpg", "background.png"))
-    assert picture is not None
+    image, background = (cv2.imread(str(folder / name)) for name in ("colour-00000.jpg", "background.png"))
+    assert image is not None
     assert background is not None
-    return picture, background
+    return image, background
 
 
 def test_filmed_shadows_are_soft_and_leave_most_of_the_light(tmp_path: Path) -> None:
-    picture, background = film_first_frame(tmp_path / "plain", shadows=False)
-    table = np.abs(picture.astype(float) - background).max(axis=2) < 10
-    picture, background = film_first_frame(tmp_path / "shaded", shadows=True)
-    left = (picture.sum(axis=2) / np.maximum(background.sum(axis=2), 1.0))[
+    image, background = film_first_frame(tmp_path / "plain", shadows=False)
+    table = np.abs(image.astype(float) - background).max(axis=2) < 10
+    image, background = film_first_frame(tmp_path / "shaded", shadows=True)
+    left = (image.sum(axis=2) / np.maximum(background.sum(axis=2), 1.0))[
         table & (background.min(axis=2) > 30)
     ]
     umbra, penumbra = (left < 0.72).sum(), ((left > 0.72) & (left < 0.92)).sum()

@@ -174,6 +174,16 @@ def matrix_to_pose(transform: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarr
     return np.concatenate([transform[..., :3, 3], matrix_to_quaternion(transform[..., :3, :3])], axis=-1)
 
 
+def planar_transform(
+    position: Float[np.ndarray, "2"] | Float[np.ndarray, "3"] | Sequence[float], angle: float
+) -> Float[np.ndarray, "4 4"]:
+    """Transform that turns about z [rad], then shifts [m]; two coordinates shift within the plane z = 0."""
+    transform = np.eye(4)
+    transform[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    transform[: len(position), 3] = position
+    return transform
+
+
 def invert_transform(transform: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
     """Inverse of a rigid transform: ``T_b_a`` from ``T_a_b``."""
     inverse = np.zeros_like(transform)

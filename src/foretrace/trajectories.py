@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from dtaidistance import dtw, dtw_ndim
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation, Slerp
 
 
 class Alignment(NamedTuple):
@@ -91,6 +92,27 @@ def rotation_error(
     apart = np.linalg.norm(a - b, axis=-1)
     together = np.linalg.norm(a + b, axis=-1)
     return 4 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together))
+
+
+def interpolate_poses(
+    times: Float[np.ndarray, " known"],
+    transforms: Float[np.ndarray, "known 4 4"],
+    at: Float[np.ndarray, " time"],
+) -> Float[np.ndarray, "time 4 4"]:
+    """Poses between known ones: positions linear, rotations the shortest way, constant beyond the first and the last.
+
+    Args:
+        times: Increasing times of the known poses [s].
+        transforms: The known poses.
+        at: Times of the wanted poses [s].
+    """
+    if len(times) == 1:
+        return np.repeat(transforms, len(at), axis=0)
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, :3, 3] = np.column_stack([np.interp(at, times, column) for column in transforms[:, :3, 3].T])
+    between = Slerp(times, Rotation.from_matrix(transforms[:, :3, :3]))
+    poses[:, :3, :3] = between(np.clip(at, times[0], times[-1])).as_matrix()
+    return poses
 
 
 def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -8,28 +8,36 @@ from foretrace.cli.console import say
 
 
 def calibrate(
-    pictures: Positional[tuple[Path, ...]] = (),
+    images: Positional[tuple[Path, ...]] = (),
     squares: tuple[int, int] = (7, 5),
     square_length: float = 0.035,
     marker_length: float = 0.026,
     dictionary: str = "5x5_100",
     out: Path = Path("camera.json"),
     print_board: Path | None = None,
+    refine: Path | None = None,
+    markers: Path | None = None,
 ) -> None:
-    """Calibrate a camera from pictures of a ChArUco board, or write the board for printing.
+    """Calibrate a camera from images of a ChArUco board, or write the board for printing.
+
+    With --refine, a camera file that does not quite fit its images is adjusted by markers of known size instead.
 
     Args:
-        pictures: Pictures or folders of pictures: 10 to 20 of the board, slanted, near and far, also in the corners.
+        images: Images or folders of images: 10 to 20 of the board, slanted, near and far, also in the corners.
         squares: Squares of the board along x and y.
         square_length: Side of a square, measured on the print [m].
         marker_length: Side of a marker [m].
         dictionary: Dictionary of its markers.
         out: File for the camera.
         print_board: Write the board to this .png or .pdf file instead.
+        refine: Camera file whose focal lengths and first radial distortion are adjusted to the images.
+        markers: Marker layout, of which the table's markers are in the images, seen from several sides.
     """
     from foretrace.errors import PerceptionError
-    from foretrace.perception.calibration import Board, read_pictures
+    from foretrace.interactions.pinhole import PinholeCamera
+    from foretrace.perception.calibration import Board, read_images, refine_camera
     from foretrace.perception.calibration import calibrate as calibrate_camera
+    from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
 
     board = Board(squares, square_length, marker_length, dictionary)
     if print_board is not None:
@@ -37,18 +45,30 @@ def calibrate(
         width, height = (1000 * length for length in board.size)
         print(f"{print_board}: print at 100 %, the board then measures {width:.1f} x {height:.1f} mm")
         return
-    if not pictures:
-        raise PerceptionError("no pictures are given: name pictures of the board, or --print-board FILE")
-    found = calibrate_camera(read_pictures(pictures), board)
+    if not images:
+        raise PerceptionError("no images are given: name images of the board, or --print-board FILE")
+    if (refine is None) != (markers is None):
+        raise PerceptionError("--refine CAMERA and --markers LAYOUT go together: give both, or neither")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if refine is not None and markers is not None:
+        taken = list(read_images(images).values())
+        name = (layout := MarkerLayout.load(markers)).dictionary
+        seen = [align_patterns(image, detect_markers(image, name), name) for image in taken]
+        camera, error = refine_camera(seen, layout.table, PinholeCamera.load(refine))
+        camera.save(out, error_pixels=error, images=len(seen))
+        print(f"focal lengths {camera.fx:.1f} and {camera.fy:.1f} pixels")
+        print(f"error {error:.3f} pixels over {len(seen)} images")
+        print(out)
+        return
+    found = calibrate_camera(read_images(images), board)
     for name, error in found.errors.items():
         print(f"{name}: {error:.3f} pixels")
     for name, reason in found.left_out.items():
         say(f"left out: {name} {reason}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    found.camera.save(out, error_pixels=found.error, pictures=len(found.errors))
+    found.camera.save(out, error_pixels=found.error, images=len(found.errors))
     camera = found.camera
     print(
         f"focal lengths {camera.fx:.1f} and {camera.fy:.1f}, centre {camera.cx:.1f}, {camera.cy:.1f} pixels"
     )
-    print(f"error {found.error:.3f} pixels over {len(found.errors)} pictures")
+    print(f"error {found.error:.3f} pixels over {len(found.errors)} images")
     print(out)

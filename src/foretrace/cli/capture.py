@@ -1,4 +1,4 @@
-"""The command that films with a RealSense camera."""
+"""The command that records with a RealSense camera."""
 
 from pathlib import Path
 
@@ -17,19 +17,19 @@ def capture(
     depth_every: int = 10,
     serial: str | None = None,
 ) -> None:
-    """Film with a RealSense camera into a folder that `import` reads. Ctrl-C ends the film. NEVER TRIED ON A CAMERA.
+    """Record with a RealSense camera into a folder that `import` reads (experimental).
 
-    Film the empty table with --background first, then put the object there and film the lever-up into the same folder.
-    Needs foretrace[realsense].
+    NEVER TRIED ON A CAMERA. Record the empty table with --background first, then put the object there and record the
+    lever-up into the same folder. Ctrl-C ends the recording. Needs foretrace[realsense].
 
     Args:
-        out: Folder for the film.
-        seconds: How long to film [s].
-        background: Take a picture of the empty table instead: the mean of half a second.
-        width: Columns of the pictures.
-        height: Rows of the pictures.
+        out: Folder for the recording.
+        seconds: How long to record [s].
+        background: Take an image of the empty table instead: the mean of half a second.
+        width: Columns of the images.
+        height: Rows of the images.
         fps: Frames per second.
-        depth_every: Keep depth, aligned with colour, with every so many pictures; 0: never.
+        depth_every: Images from one with aligned depth to the next; 0: no depth.
         serial: Serial number of the camera, if there are several.
     """
     import signal
@@ -38,30 +38,32 @@ def capture(
     import numpy as np
 
     from foretrace.errors import PerceptionError
-    from foretrace.interactions import film_folder
-    from foretrace.interactions.film_folder import FilmNotes, write_film
+    from foretrace.interactions import recording_folder
+    from foretrace.interactions.recording_folder import RecordingNotes, write_recording
     from foretrace.perception.realsense import CaptureConfig, LiveCamera
 
     if not 0 < seconds < float("inf"):
-        raise PerceptionError(f"--seconds is {seconds}: give a number above 0; Ctrl-C ends the film earlier")
-    taken = out / (film_folder.BACKGROUND if background else film_folder.TIMES)
+        raise PerceptionError(
+            f"--seconds is {seconds}: give a number above 0; Ctrl-C ends the recording earlier"
+        )
+    taken = out / (recording_folder.BACKGROUND if background else recording_folder.TIMES)
     if taken.exists():
         raise PerceptionError(f"{taken} is there already: choose another folder")
     out.mkdir(parents=True, exist_ok=True)
     with LiveCamera(CaptureConfig(width, height, fps, 0 if background else depth_every, serial)) as camera:
         if background:
-            pictures = [frame.picture for frame in camera.frames(lambda time: time > 0.5)]
-            film_folder.write_picture(taken, np.rint(np.mean(pictures, axis=0)).astype(np.uint8))
+            images = [frame.image for frame in camera.frames(lambda time: time > 0.5)]
+            recording_folder.write_image(taken, np.rint(np.mean(images, axis=0)).astype(np.uint8))
             print(taken)
             return
         stop = threading.Event()
         before = signal.signal(signal.SIGINT, lambda *_: stop.set())
         try:
             frames = camera.frames(lambda time: stop.is_set() or time > seconds)
-            count = write_film(out, frames, FilmNotes())
+            count = write_recording(out, frames, RecordingNotes())
         finally:
             signal.signal(signal.SIGINT, before)
-    intrinsics = out / film_folder.CAMERA
+    intrinsics = out / recording_folder.CAMERA
     if camera.camera is None:
         say(
             f"the lens is described in a way that cannot be used: make {intrinsics} with `foretrace calibrate`"

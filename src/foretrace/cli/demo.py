@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foretrace.cli.evaluation import print_errors
-from foretrace.cli.outlines import read_mask
+from foretrace.objects.shape_files import read_silhouette_image
 
 if TYPE_CHECKING:
     from foretrace.interactions.record import Interaction
@@ -100,7 +100,7 @@ def _racket() -> "tuple[Interaction, TopDownView]":
     from foretrace.objects import Prism
     from foretrace.simulation.lever_up import simulate_lever_up
 
-    mask = read_mask(Path(__file__).parents[1] / "assets" / "racket.png")
+    mask = read_silhouette_image(Path(__file__).parents[1] / "assets" / "racket.png")
     racket = Prism.from_mask(mask, RACKET_SCALE, RACKET_HEIGHT)
     action = LeverUp.nearest(racket, (0.06, 0.09))
     view = TopDownView.from_mask(mask, RACKET_SCALE, action.contact, action.direction, RACKET_HEIGHT)

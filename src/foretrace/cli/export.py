@@ -25,7 +25,7 @@ def export_rosbag(
         out: Folder to make for the bags.
         run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
         ros: Version of ROS. 2: MCAP. 1: a .bag file.
-        camera: Whether simulated interactions get the pictures of a camera beside the table.
+        camera: Whether simulated interactions get the images of a camera beside the table.
     """
     from foretrace.export.delivery import require
     from foretrace.export.episodes import choose
@@ -47,7 +47,7 @@ def export_rerun(
         ids: Numbers of the interactions.
         out: Folder to make for the recordings.
         run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
-        camera: Whether simulated interactions get the pictures of a camera beside the table.
+        camera: Whether simulated interactions get the images of a camera beside the table.
     """
     from foretrace.export.delivery import require
     from foretrace.export.episodes import choose
@@ -76,7 +76,7 @@ def export_lerobot(
         run: Folder of a training, whose predictor's imagined motion is written beside the observed one. If it was
             trained on this data set, episodes are ordered and split by its parts.
         fps: Frames per second, to which all are resampled; by default the rate at which they were sampled.
-        camera: Render the pictures of a camera beside the table; for simulated interactions only.
+        camera: Render the images of a camera beside the table; for simulated interactions only.
     """
     from foretrace.export.episodes import choose_by_part
     from foretrace.export.lerobot import export_lerobot
@@ -100,7 +100,7 @@ def export_onnx(run: Positional[Path | None] = None, out: Path = Path("model.onn
     for name, meaning in written.inputs.items():
         print(f"reads {name}: {meaning}")
     for name, meaning in written.outputs.items():
-        print(f"says {name}: {meaning}; at most {written.differences[name]:.1e} from PyTorch")
+        print(f"returns {name}: {meaning}; at most {written.differences[name]:.1e} from PyTorch")
     print(written.path)
 
 

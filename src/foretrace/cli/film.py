@@ -1,4 +1,4 @@
-"""The command that films a simulated lever-up, for whoever has no camera and no robot."""
+"""The command that films a simulated lever-up, without a camera or a robot."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -30,37 +30,36 @@ def film(
 ) -> None:
     """Film a lever-up of a data set, simulated anew, as a camera above a real table would: a folder for `import`.
 
-    The film has a lens, blur, noise and changing light, markers on table and object, and a picture of the empty table.
-    What it shows exactly is in truth.json, which `import` does not read.
+    The recording has a lens, blur, noise and changing light, markers on table and object, and an image of the empty
+    table. What it shows exactly is in truth.json, which `import` does not read.
 
     Args:
         data: Folder of the data set.
         id: Number of the interaction.
         out: Folder to make.
-        width: Columns of the pictures; they have 9/16 as many rows.
+        width: Columns of the images; they have 9/16 as many rows.
         fps: Frames per second.
         slant: Angle of the camera's line of sight from the vertical [rad].
         azimuth: Where the camera stands, from the action's direction towards its left [rad].
         distance: From the camera to the point on the table that it looks at [m].
-        depth_every: Keep depth with every so many pictures; 0: never.
+        depth_every: Images from one with depth to the next; 0: no depth.
         embodiment: What moves the blade: nothing that is seen, or the whole arm; by default as in the data set.
-        board: Film so many pictures of a calibration board, too, and leave the camera's file to `calibrate`.
+        board: Number of images of a calibration board to take, too; they leave the camera's file to `calibrate`.
         shadows: Let a slanted lamp of some size cast soft shadows.
         table: How the table looks.
         object_colour: The object's colour; grey resembles the plain table, brown the wooden one.
         seed: Seed of noise, clock, table, and of where marker and lamp are.
     """
-    import json
-
     import numpy as np
 
     from foretrace.errors import DatasetError, PerceptionError, SimulationError
+    from foretrace.files import write_json
     from foretrace.geometry import invert_transform
-    from foretrace.interactions import film_folder
+    from foretrace.interactions import recording_folder
     from foretrace.interactions.dataset import Dataset
-    from foretrace.simulation.film import FilmConfig, film_lever_up
     from foretrace.simulation.lens import WEBCAM
     from foretrace.simulation.lever_up import SimulationConfig
+    from foretrace.simulation.recording import RecordingConfig, record_lever_up
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise PerceptionError(f"{out} is in use: choose another folder")
@@ -71,7 +70,7 @@ def film(
     rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
     if len(rows) == 0:
         raise DatasetError(
-            f"{data} has no interaction {id} with a motion: `foretrace describe` tells what it has"
+            f"{data} has no interaction {id} with a motion: `foretrace describe` lists what it has"
         )
     shown = dataset[int(rows[0])]
     camera = WEBCAM.scaled(width / WEBCAM.width)
@@ -79,7 +78,7 @@ def film(
     simulation = SimulationConfig(
         embodiment=embodiment or recorded.get("embodiment", "tool"), physics=shown.physics
     )
-    config = FilmConfig(
+    config = RecordingConfig(
         camera,
         distance,
         slant,
@@ -94,9 +93,9 @@ def film(
     obj, action = shown.object, shown.action
     if board:
         _film_board(out / "board", board, camera, seed)
-    truth = film_lever_up(obj, action, out, config, seed=seed)
-    (out / film_folder.OBJECT).write_text(json.dumps(obj.to_dict()) + "\n", encoding="utf-8")
-    intrinsics = out / film_folder.CAMERA
+    truth = record_lever_up(obj, action, out, config, seed=seed)
+    write_json(out / recording_folder.OBJECT, obj.to_dict())
+    intrinsics = out / recording_folder.CAMERA
     if not board:
         camera.save(intrinsics)
     rim = truth.T_table_object[0] @ np.array([*action.contact, obj.height, 1.0])
@@ -109,19 +108,19 @@ def film(
     print(f"{len(truth.times)} frames: {out}")
     if board:
         print(
-            f"{board} pictures of a board: {out / 'board'}; foretrace calibrate {out / 'board'} --out {intrinsics}"
+            f"{board} images of a board: {out / 'board'}; foretrace calibrate {out / 'board'} --out {intrinsics}"
         )
     print(f"contact: --contact {x:.4f} {y:.4f}, in the first frame --contact-px {column:.0f} {row:.0f}")
 
 
 def _film_board(folder: Path, num: int, camera: "PinholeCamera", seed: int) -> None:
-    """Pictures of the usual calibration board."""
-    from foretrace.interactions import film_folder
+    """Images of the default calibration board."""
+    from foretrace.interactions import recording_folder
     from foretrace.perception.calibration import Board
-    from foretrace.simulation.film import film_board
+    from foretrace.simulation.recording import photograph_board
 
     folder.mkdir(parents=True)
     printed = Board()
-    pictures = film_board(printed.draw(4000.0), printed.size, camera, num, seed=seed)
-    for number, picture in enumerate(pictures):
-        film_folder.write_picture(folder / f"{number:02d}.png", picture)
+    images = photograph_board(printed.draw(4000.0), printed.size, camera, num, seed=seed)
+    for number, image in enumerate(images):
+        recording_folder.write_image(folder / f"{number:02d}.png", image)

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from foretrace.cli.console import say
-from foretrace.cli.outlines import read_mask, read_polygon
-from foretrace.cli.recordings import MaskMethod, look_at_photo
 from foretrace.errors import ActionError, PredictionError, TrainingError
 
 if TYPE_CHECKING:
@@ -132,7 +130,9 @@ def predict(
     camera: Path | None = None,
     markers: Path | None = None,
     contact_px: tuple[float, float] | None = None,
-    mask: MaskMethod = "grabcut",
+    mask: Literal["background", "threshold", "colour", "grabcut", "depth"] | None = None,
+    depth: Path | None = None,
+    flat: bool = True,
     background: Path | None = None,
     shadows: bool = True,
     box: tuple[int, int, int, int] | None = None,
@@ -159,16 +159,21 @@ def predict(
         image: Picture of the object's silhouette, white on black; needs --scale.
         scale: Metres per pixel of the image, or per unit of the mesh (1 by default).
         mesh: STL or OBJ file of the object.
-        height: Height of a polygon or image's object [m], 0.02 by default; a mesh has its own.
+        height: Height of a polygon's, image's or photograph's object [m], 0.02 by default; a mesh has its own.
         edge: Number of the outline's edge to lever at; edge k runs from corner k to corner k + 1.
         fraction: How far along that edge, between 0 and 1.
         contact: Point to lever at instead, in the object's frame [m]; snapped to the outline. An image's frame has
             its origin at the silhouette's centroid, x to the right and y up.
-        photo: Photograph of the object among markers on the table; the prediction is drawn onto it.
+        photo: Photograph of the object on the table; the prediction is drawn onto it.
         camera: The camera's JSON file, from `foretrace calibrate`; by default camera.json beside the photograph.
-        markers: Layout of the markers on the table; by default markers.json beside the photograph.
+        markers: Layout of the markers on the table; by default markers.json beside the photograph. Not needed with
+            --depth, which shows the table, too.
         contact_px: Column and row in the photograph of the point to lever at, on the object's upper rim.
-        mask: How the object is found in the photograph.
+        mask: How the object is found in the photograph; by default grabcut with --box, otherwise by background or
+            depth, whichever is given.
+        depth: Depth image of the photograph's size: PNG of 16 bits in millimetres, or .npy in metres. It measures the
+            object's height, unless --height is given.
+        flat: Whether the object's top is level; otherwise the view has the heights of the depth image.
         background: Photograph of the table without the object, for --mask background.
         shadows: Whether the object may cast shadows, which --mask background then tells from it.
         box: Left, top, width and height of a box round the object, for --mask grabcut.
@@ -189,6 +194,7 @@ def predict(
     from foretrace.actions import Stroke
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
     from foretrace.interactions.record import Physics
+    from foretrace.perception.photo import PhotoConfig, open_photo
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import Scene, scene_figure
     from foretrace.predictor import load_predictor
@@ -201,16 +207,24 @@ def predict(
             raise PredictionError(
                 "--photo shows the object: leave out the other ways, and --edge and --contact"
             )
-        seen = look_at_photo(photo, camera, markers, height, contact_px, mask, background, box, hull, shadows)
-        obj, action, view, com = (
-            seen.sight.placed.object,
-            seen.sight.action,
-            seen.sight.view,
-            seen.sight.com_in_action,
+        if contact_px is None:
+            raise PredictionError("--photo needs --contact-px COLUMN ROW, a pixel on the object's upper rim")
+        seen = open_photo(
+            photo,
+            contact_px,
+            camera=camera,
+            markers=markers,
+            depth=depth,
+            background=background,
+            config=PhotoConfig(mask, box, height, hull, shadows, flat),
         )
+        obj, action, view, com = seen.placed.object, seen.action, seen.view, seen.com
     else:
         of_photo = {"camera": camera, "markers": markers, "contact-px": contact_px}
         of_photo |= {
+            "mask": mask,
+            "depth": depth,
+            "no-flat": not flat or None,
             "background": background,
             "no-shadows": not shadows or None,
             "box": box,
@@ -284,6 +298,7 @@ def _object_and_action(
     from foretrace.geometry import transform_points
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import MeshObject, Prism
+    from foretrace.objects.shape_files import read_polygon, read_silhouette_image
 
     given = [name for name, value in (("polygon", polygon), ("image", image), ("mesh", mesh)) if value]
     if len(given) != 1:
@@ -306,7 +321,7 @@ def _object_and_action(
         if scale is None:
             raise PredictionError("--image needs --scale, the metres per pixel")
         assert image is not None
-        mask = read_mask(image)
+        mask = read_silhouette_image(image)
         obj = Prism.from_mask(mask, scale, height)
     if contact is not None:
         action = LeverUp.nearest(obj, contact)

@@ -1,4 +1,4 @@
-"""The command that draws prediction and observation over a film that was imported."""
+"""The command that draws prediction and observation over a recording that was imported."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 def overlay(
     data: Positional[Path], id: Positional[int], out: Path, run: Path | None = None, topic: str | None = None
 ) -> None:
-    """Draw what a predictor expects and what was observed over an imported film, frame by frame, as an MP4.
+    """Draw what a predictor expects and what was observed over an imported recording, frame by frame, as an MP4.
 
-    Beside it a picture is written that shows both paths from the side, its name with "-side.png" in place of ".mp4".
+    Beside it an image is written that shows both paths from the side, its name with "-side.png" in place of ".mp4".
 
     Red: predicted, before the touch. Green: observed so far. White: the object's outline. A translucent tube: how
-    uncertain the prediction is, where the predictor says so. Needs foretrace[video], and the film where it was when it
-    was imported.
+    uncertain the prediction is, if the predictor predicts it. Needs foretrace[video], and the recording
+    where it was when it was imported.
 
     Args:
         data: Folder of the recorded data set.
@@ -37,23 +37,23 @@ def overlay(
     from foretrace.experiments.transfer_figures import side_figure
     from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.recorded import read_notes
-    from foretrace.perception.films import open_film
     from foretrace.perception.overlay import write_video
+    from foretrace.perception.recordings import open_recording
     from foretrace.predictor import load_predictor
 
     if out.suffix.lower() != ".mp4":
-        raise PerceptionError(f"cannot write a film to {out}: choose a name that ends in .mp4")
+        raise PerceptionError(f"cannot write a video to {out}: choose a name that ends in .mp4")
     dataset = Dataset.open(data)
     rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
-    said = read_notes(data, id)
+    notes = read_notes(data, id)
     if len(rows) == 0:
         raise DatasetError(f"{data} has no recording {id}: give a data set that `foretrace import` made")
     row = int(rows[0])
     imagined = load_predictor(run).imagine_batch(dataset[row : row + 1].batch())[0]
-    film = open_film(said["recording"], topic)
-    times = np.array(said["frame_times"])
-    pictures = _drawn(film.frames(), said, dataset[row], imagined)
-    count = write_video(out, pictures, float(1 / np.median(np.diff(times))))
+    recording = open_recording(notes["recording"], topic)
+    times = np.array(notes["frame_times"])
+    images = _drawn(recording.frames(), notes, dataset[row], imagined)
+    count = write_video(out, images, float(1 / np.median(np.diff(times))))
     print(f"{count} frames: {out}")
     effect, side = dataset[row].effect, out.with_name(f"{out.stem}-side.png")
     end = None if effect.slip_index is None else effect.times[effect.slip_index]
@@ -67,14 +67,14 @@ def overlay(
 def _drawn(
     frames: "Iterator[Any]", notes: dict[str, Any], interaction: "Interaction", imagined: "ImaginedEffect"
 ) -> "Iterator[np.ndarray]":
-    """The film's pictures with outline and paths in them."""
+    """The recording's images with outline and paths in them."""
     import numpy as np
 
     from foretrace.cli.futures import radius_of
     from foretrace.geometry import pose_to_matrix, transform_points
     from foretrace.interactions.pinhole import PinholeCamera
     from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
-    from foretrace.perception.tracking import slerp
+    from foretrace.trajectories import interpolate_poses
 
     camera = PinholeCamera.from_dict(notes["camera"], "the recording's camera")
     T_action_camera = np.array(notes["T_action_camera"])
@@ -84,14 +84,12 @@ def _drawn(
     radius = radius_of(imagined)
     for frame in frames:
         time = frame.time - notes["start"]
-        here = np.eye(4)
-        here[:3, 3] = [np.interp(time, effect.times, poses[:, axis, 3]) for axis in range(3)]
-        here[:3, :3] = slerp(effect.times, poses[:, :3, :3], np.array([time]))[0]
+        here = interpolate_poses(effect.times, poses, np.array([time]))[0]
         paths = {
             "predicted": (imagined.com_trajectory, PREDICTED),
             "observed": (effect.com_trajectory[effect.times <= max(time, 0.0)], OBSERVED),
         }
         radii = None if radius is None else {"predicted": np.asarray(radius, dtype=float)}
         yield draw_overlay(
-            frame.picture, camera, T_action_camera, transform_points(here, rim), paths, radii=radii
+            frame.image, camera, T_action_camera, transform_points(here, rim), paths, radii=radii
         )

@@ -28,9 +28,9 @@ def robot(
     deviation: float = 0.05,
     camera: str | None = None,
 ) -> None:
-    """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm. NEVER TRIED ON A REAL ARM.
+    """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm (experimental).
 
-    This has only ever moved a simulated controller in foretrace's tests. Keep the emergency stop in hand.
+    NEVER TRIED ON A REAL ARM: it has moved a simulated controller only. Keep the emergency stop in hand.
 
     Without --execute this is a dry run: no connection is opened. Links are checked against the table, not against
     each other, the object or anything else.
@@ -55,9 +55,9 @@ def robot(
     from foretrace.robot.checks import ArmLimits, check_path, refuse_unsafe
     from foretrace.robot.execution import WatchConfig
     from foretrace.robot.execution import execute as move
-    from foretrace.robot.filming import Filming
     from foretrace.robot.kinematics import ArmKinematics
     from foretrace.robot.path import plan_lever_up, plan_retreat, read_base_pose
+    from foretrace.robot.video import VideoRecorder
     from foretrace.simulation.tool import Tool
 
     if execute and host is None:
@@ -89,8 +89,8 @@ def robot(
     say("this has never moved a real arm: keep the emergency stop in hand; Ctrl-C stops the arm, too")
     recording = out / "recording.csv"
     try:
-        film = None if camera is None else Filming(camera, out / "film")
-        move(host, legs, kinematics, T_table_base, recording, limits, watch, confirm, film)
+        video = None if camera is None else VideoRecorder(camera, out / "film")
+        move(host, legs, kinematics, T_table_base, recording, limits, watch, confirm, video)
     except KeyboardInterrupt:
         done = (
             f"the arm was told to stop, {recording} has what was done"
@@ -103,14 +103,14 @@ def robot(
 
 
 def _agreed(host: str, num_set_points: int) -> bool:
-    """Ask whoever is at the terminal."""
+    """Whether the user agrees at the terminal."""
     from foretrace.simulation.arm import CONTROL_PERIOD
 
     seconds = num_set_points * CONTROL_PERIOD
     try:
         answer = input(f"Move the arm at {host} for {seconds:.0f} s and its way to the start? Type yes: ")
     except EOFError:
-        raise RobotError("nobody can confirm: run it in a terminal, or give --yes") from None
+        raise RobotError("no terminal to confirm in: run it in a terminal, or give --yes") from None
     return answer.strip() == "yes"
 
 
@@ -139,11 +139,11 @@ def _print_checks(checks: "list[Check]") -> None:
 
 def _write(out: Path, legs: "list[ArmPath]", tips: "list[list[np.ndarray]]", checks: "list[Check]") -> None:
     """The planned path, with the blade tip in the table frame, and its checks."""
-    import json
     from dataclasses import asdict
 
     import pandas as pd
 
+    from foretrace.files import write_json
     from foretrace.geometry import matrix_to_pose
     from foretrace.simulation.arm import JOINT_NAMES
 
@@ -156,6 +156,6 @@ def _write(out: Path, legs: "list[ArmPath]", tips: "list[list[np.ndarray]]", che
     columns = ["time_s", "leg", *(f"{name}_rad" for name in JOINT_NAMES), *tip_columns]
     pd.DataFrame(rows, columns=columns).to_csv(out / "path.csv", index=False, float_format="%.6f")
     report = [{**asdict(check), "passed": check.passed} for check in checks]
-    (out / "checks.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    write_json(out / "checks.json", report)
     print(out / "path.csv")
     print(out / "checks.json")

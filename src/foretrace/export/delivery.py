@@ -8,10 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from foretrace.errors import ExportError
+from foretrace.files import PARTIAL
+from foretrace.workers import ProgressReport
 
 T = TypeVar("T")
 
@@ -42,7 +41,7 @@ def delivered(out: Path) -> Iterator[Path]:
     """
     if out.exists() or out.is_symlink():
         raise ExportError(f"{out} exists already and is not overwritten: choose another --out, or remove it")
-    draft = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    draft = out.with_name(f".{out.name}.{os.getpid()}{PARTIAL}")
     try:
         draft.mkdir(parents=True)
     except OSError as error:
@@ -54,9 +53,9 @@ def delivered(out: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def watched(items: Sequence[T], what: str) -> Iterator[T]:
-    """The items one by one, with a bar on the terminal that shows how many are done."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield from bar.track(items, total=len(items), description=what)
+def watched(items: Sequence[T], noun: str) -> Iterator[T]:
+    """The items one by one, with progress on the console."""
+    with ProgressReport(noun, len(items)) as report:
+        for item in items:
+            yield item
+            report.add()

@@ -1,7 +1,6 @@
 """Interactions as a LeRobotDataset v3.0: Parquet files and their description, which LeRobot's loader reads."""
 
 import io
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,16 @@ from PIL import Image
 
 from foretrace.errors import ExportError
 from foretrace.export.delivery import delivered, watched
+from foretrace.export.episode_statistics import (
+    Statistics,
+    all_statistics,
+    image_statistics,
+    vector_statistics,
+)
 from foretrace.export.episodes import Episode
-from foretrace.export.pictures import CAMERA, take_pictures
+from foretrace.export.images import CAMERA, render_images
 from foretrace.export.resampling import frame_times, frames_per_second, resample, resample_poses
-from foretrace.export.statistics import Statistics, all_statistics, picture_statistics, vector_statistics
+from foretrace.files import write_json
 from foretrace.interactions.topdown import VIEW_SIZE
 
 CODEBASE_VERSION = "v3.0"
@@ -36,7 +41,7 @@ VIEW, COLOUR, DEPTH = (
     "observation.images.camera",
     "observation.images.camera_depth",
 )
-PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 INDICES = {
     name: {"dtype": kind, "shape": [1], "names": None}
     for name, kind in (
@@ -76,11 +81,11 @@ def export_lerobot(
         out: Folder to make.
         fps: Frames per second, to which recordings are resampled; by default that of the interactions, which
             must then be sampled alike.
-        camera: Whether to render the pictures of a camera beside the table; for simulated interactions only.
+        camera: Whether to render the images of a camera beside the table; for simulated interactions only.
         splits: Which episodes are in which part; by default all are in ``train``.
 
     Raises:
-        ExportError: The folder exists, the interactions are not sampled alike, or pictures cannot be had.
+        ExportError: The folder exists, the interactions are not sampled alike, or images cannot be had.
     """
     with delivered(out) as folder:
         layout = _layout(episodes, fps, camera)
@@ -109,15 +114,15 @@ def _layout(episodes: Sequence[Episode], fps: int | None, camera: bool) -> Layou
             [*(f"object_{name}" for name in POSE_NAMES), "com_x", "com_y", "com_z"]
         ),
         "action": _vector([f"tool_{name}" for name in POSE_NAMES]),
-        VIEW: _picture(VIEW_SIZE, VIEW_SIZE, depth=True),
+        VIEW: _image(VIEW_SIZE, VIEW_SIZE, depth=True),
     }
     if len(joints) == 1 and (num_joints := joints.pop()) > 0:
         features["observation.joints"] = _vector([f"joint_{k}" for k in range(num_joints)])
     if episodes[0].imagined is not None:
         features["imagined.com"] = _vector(["com_x", "com_y", "com_z"])
     if camera:
-        features[COLOUR] = _picture(CAMERA.height, CAMERA.width, depth=False)
-        features[DEPTH] = _picture(CAMERA.height, CAMERA.width, depth=True)
+        features[COLOUR] = _image(CAMERA.height, CAMERA.width, depth=False)
+        features[DEPTH] = _image(CAMERA.height, CAMERA.width, depth=True)
     return Layout(fps, features | INDICES)
 
 
@@ -131,7 +136,7 @@ def _vector(names: list[str]) -> dict[str, Any]:
     return {"dtype": "float32", "shape": [len(names)], "names": names}
 
 
-def _picture(height: int, width: int, depth: bool) -> dict[str, Any]:
+def _image(height: int, width: int, depth: bool) -> dict[str, Any]:
     info = {"is_depth_map": True, "depth_unit": "m"} if depth else {"is_depth_map": False}
     shape = [height, width, 1 if depth else 3]
     return {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"], "info": info}
@@ -143,7 +148,7 @@ def _schema(features: Features) -> pa.Schema:
     columns = []
     for name, feature in features.items():
         if feature["dtype"] == "image":
-            kind: pa.DataType = PICTURE
+            kind: pa.DataType = IMAGE
         else:
             kind, size = kinds[feature["dtype"]], feature["shape"][0]
             kind = kind if size == 1 else pa.list_(kind, size)
@@ -204,7 +209,7 @@ def _open(
 
 
 def _columns(episode: Episode, layout: Layout, number: int, start: int) -> dict[str, np.ndarray]:
-    """Every feature of one episode, frame by frame; pictures as (frames, rows, columns, channels)."""
+    """Every feature of one episode, frame by frame; images as (frames, rows, columns, channels)."""
     interaction = episode.interaction
     effect = interaction.effect
     times = frame_times(effect.times, layout.fps)
@@ -230,7 +235,7 @@ def _columns(episode: Episode, layout: Layout, number: int, start: int) -> dict[
         there = episode.imagined.times - effect.times[0]
         columns["imagined.com"] = resample(there, episode.imagined.com_trajectory, times)
     if COLOUR in layout.features:
-        seen = take_pictures(interaction, thing, tool)
+        seen = render_images(interaction, thing, tool)
         columns |= {COLOUR: seen.rgb, DEPTH: seen.depth[..., None]}
     return columns
 
@@ -239,7 +244,7 @@ def _table(columns: dict[str, np.ndarray], schema: pa.Schema) -> pa.Table:
     arrays = []
     for field in schema:
         values = columns[field.name]
-        if field.type == PICTURE:
+        if field.type == IMAGE:
             arrays.append(_encoded(values))
         elif pa.types.is_fixed_size_list(field.type):
             flat = pa.array(np.ravel(values).astype(np.float32))
@@ -249,25 +254,25 @@ def _table(columns: dict[str, np.ndarray], schema: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _encoded(pictures: np.ndarray) -> pa.Array:
-    """Pictures in files of their own: PNG for colour, TIFF of 32-bit floats for depth."""
+def _encoded(images: np.ndarray) -> pa.Array:
+    """Images in files of their own: PNG for colour, TIFF of 32-bit floats for depth."""
     rows, last, content = [], None, b""
-    for k, picture in enumerate(pictures):
-        if last is None or not np.array_equal(picture, last):
-            depth, buffer, last = picture.shape[-1] == 1, io.BytesIO(), picture
+    for k, image in enumerate(images):
+        if last is None or not np.array_equal(image, last):
+            depth, buffer, last = image.shape[-1] == 1, io.BytesIO(), image
             if depth:
-                Image.fromarray(picture[..., 0]).save(buffer, "TIFF", compression="tiff_adobe_deflate")
+                Image.fromarray(image[..., 0]).save(buffer, "TIFF", compression="tiff_adobe_deflate")
             else:
-                Image.fromarray(picture).save(buffer, "PNG")
+                Image.fromarray(image).save(buffer, "PNG")
             content = buffer.getvalue()
-        name = f"frame-{k:06d}.{'tiff' if picture.shape[-1] == 1 else 'png'}"
+        name = f"frame-{k:06d}.{'tiff' if image.shape[-1] == 1 else 'png'}"
         rows.append({"bytes": content, "path": name})
-    return pa.array(rows, type=PICTURE)
+    return pa.array(rows, type=IMAGE)
 
 
 def _episode_statistics(columns: dict[str, np.ndarray], features: Features) -> dict[str, Statistics]:
     return {
-        name: picture_statistics(columns[name])
+        name: image_statistics(columns[name])
         if feature["dtype"] == "image"
         else vector_statistics(columns[name])
         for name, feature in features.items()
@@ -314,6 +319,6 @@ def _write_description(
         for feature in layout.features
     }
     for name, content in (("info", info), ("stats", whole)):
-        (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+        write_json(folder / "meta" / f"{name}.json", content, indent=4)
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task"))
     tasks.to_parquet(folder / "meta" / "tasks.parquet")

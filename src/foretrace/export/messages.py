@@ -170,7 +170,7 @@ class Messages:
         return self.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=opacity)
 
     def image(self, stamp: int, frame: str, pixels: np.ndarray) -> Any:
-        """A picture: (rows, columns, 3) uint8 in colour, or (rows, columns) float32 in metres."""
+        """An image: (rows, columns, 3) uint8 in colour, or (rows, columns) float32 in metres."""
         height, width = pixels.shape[:2]
         little_endian = pixels if pixels.dtype == np.uint8 else pixels.astype("<f4")
         data: UInt8[np.ndarray, " bytes"] = np.frombuffer(little_endian.tobytes(), dtype=np.uint8)

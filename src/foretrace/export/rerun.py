@@ -1,4 +1,4 @@
-"""Interactions as Rerun recordings: the scene over time, pictures, curves, and how the viewer arranges them."""
+"""Interactions as Rerun recordings: the scene over time, images, curves, and how the viewer arranges them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
-from foretrace.export.pictures import Pictures, take_pictures
+from foretrace.export.images import RenderedImages, render_images
 from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, Colour, tool_parts
 from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Effect
@@ -32,7 +32,7 @@ def export_rerun(episodes: Sequence[Episode], out: Path, camera: bool = True) ->
     Args:
         episodes: What to write.
         out: Folder to make: ``interaction-000012.rrd`` and so on.
-        camera: Whether simulated interactions get the pictures of a camera beside the table.
+        camera: Whether simulated interactions get the images of a camera beside the table.
 
     Raises:
         ExportError: The folder exists, or the machine cannot render.
@@ -48,7 +48,7 @@ def write_recording(episode: Episode, path: Path, camera: bool) -> None:
     effect = interaction.effect
     seen = None
     if camera and interaction.provenance.source == "simulated":
-        seen = take_pictures(interaction, effect.pose_trajectory, effect.tool_trajectory)
+        seen = render_images(interaction, effect.pose_trajectory, effect.tool_trajectory)
     # Ids of its own, and no properties: equal interactions give recordings of equal contents.
     recording = rr.RecordingStream(
         APPLICATION, recording_id=f"interaction-{interaction.id}", send_properties=False
@@ -59,13 +59,13 @@ def write_recording(episode: Episode, path: Path, camera: bool) -> None:
     _log_motion(recording, episode)
     _log_curves(recording, episode)
     if seen is not None:
-        _log_pictures(recording, effect.times, seen)
+        _log_images(recording, effect.times, seen)
     recording.flush()
     recording.disconnect()
 
 
-def _blueprint(pictures: bool) -> rrb.Blueprint:
-    """The scene on the left; pictures and curves on the right."""
+def _blueprint(camera: bool) -> rrb.Blueprint:
+    """The scene on the left; images and curves on the right."""
     scene = rrb.Spatial3DView(
         name="Action frame",
         origin="/action",
@@ -74,7 +74,7 @@ def _blueprint(pictures: bool) -> rrb.Blueprint:
         eye_controls=rrb.EyeControls3D(position=(0.25, -0.42, 0.3), look_target=(0.05, 0.0, 0.03)),
     )
     images = [rrb.Spatial2DView(name="Height from above", origin="/view/height")]
-    if pictures:
+    if camera:
         images += [
             rrb.Spatial2DView(name="Camera", origin="/action/camera", contents=["$origin/color"]),
             rrb.Spatial2DView(name="Depth", origin="/action/camera", contents=["$origin/depth"]),
@@ -205,7 +205,9 @@ def _curve(
     recording.send_columns(f"curves/{entity}", indexes=[index], columns=rr.Scalars.columns(scalars=values))
 
 
-def _log_pictures(recording: rr.RecordingStream, times: Float[np.ndarray, " time"], seen: Pictures) -> None:
+def _log_images(
+    recording: rr.RecordingStream, times: Float[np.ndarray, " time"], seen: RenderedImages
+) -> None:
     camera = seen.camera
     pinhole = rr.Pinhole(
         focal_length=[camera.fx, camera.fy],

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
 
 from foretrace.errors import ExportError
+from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.record import Effect
+from foretrace.trajectories import interpolate_poses
 
 EVEN = 1e-3
 """Sampling counts as even if no sample is off its time by more than this [s]."""
@@ -62,11 +63,8 @@ def resample_poses(
     times: Float[np.ndarray, " time"], poses: Float[np.ndarray, "time 7"], at: Float[np.ndarray, " frame"]
 ) -> Float[np.ndarray, "frame 7"]:
     """Poses between samples: positions [m] linearly, quaternions (w, x, y, z) on the shortest way."""
-    positions = resample(times, poses[:, :3], at)
-    rotations = Rotation.from_quat(poses[:, 3:], scalar_first=True)
-    between = Slerp(times, rotations)(np.clip(at, times[0], times[-1])) if len(times) > 1 else rotations
-    quaternions = between.as_quat(scalar_first=True)
+    found = matrix_to_pose(interpolate_poses(times, pose_to_matrix(poses), at))
     # Of a quaternion's two signs the one nearer to the recorded quaternion, so that rows stay continuous.
     nearest = poses[np.abs(times[None] - at[:, None]).argmin(axis=1), 3:]
-    quaternions *= np.where((quaternions * nearest).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    return np.concatenate([positions, quaternions], axis=1)
+    found[:, 3:] *= np.where((found[:, 3:] * nearest).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    return found

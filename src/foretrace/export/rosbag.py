@@ -17,8 +17,8 @@ from rosbags.typesys import Stores
 
 from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
+from foretrace.export.images import RenderedImages, render_images
 from foretrace.export.messages import TRANSFORMS, Messages
-from foretrace.export.pictures import Pictures, take_pictures
 from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, tool_parts
 from foretrace.geometry import matrix_to_pose
 from foretrace.objects.surface import triangles_of
@@ -32,7 +32,7 @@ START = 1.0
 MARKER_PERIOD = 1.0
 """Markers that hang on a frame are sent anew so often [s], for viewers that join late."""
 MOST_PATHS = 60
-"""The observed path is sent so many times at most, ever longer."""
+"""Most messages with the observed path, each longer than the one before."""
 DOT = np.full(3, 0.012)
 """Size of the dots at the centres of mass [m]."""
 TOPICS = {
@@ -74,7 +74,7 @@ def export_rosbags(
         episodes: What to write.
         out: Folder to make: ``interaction-000012`` for ROS 2 (MCAP), ``interaction-000012.bag`` for ROS 1.
         version: Version of ROS.
-        camera: Whether simulated interactions get the pictures of a camera beside the table.
+        camera: Whether simulated interactions get the images of a camera beside the table.
 
     Raises:
         ExportError: The folder exists, or the machine cannot render.
@@ -98,13 +98,13 @@ def said(episode: Episode, make: Messages, camera: bool) -> list[Said]:
     seen = None
     if camera and interaction.provenance.source == "simulated":
         effect = interaction.effect
-        seen = take_pictures(interaction, effect.pose_trajectory, effect.tool_trajectory)
+        seen = render_images(interaction, effect.pose_trajectory, effect.tool_trajectory)
     messages = [
         *_at_rest(episode, make, seen),
         *_moving_frames(episode, make),
         *_observed_paths(episode, make),
         *_markers(episode, make),
-        *_pictures(interaction.effect.times, make, seen),
+        *_images(interaction.effect.times, make, seen),
     ]
     return sorted(messages, key=lambda each: each.stamp)
 
@@ -114,7 +114,7 @@ def stamps_of(times: Float[np.ndarray, " time"]) -> list[int]:
     return [round((START + float(time)) * 1e9) for time in times]
 
 
-def _at_rest(episode: Episode, make: Messages, seen: Pictures | None) -> Iterator[Said]:
+def _at_rest(episode: Episode, make: Messages, seen: RenderedImages | None) -> Iterator[Said]:
     """What is known before the blade moves: the view from above, the imagined path, where the camera is."""
     interaction, first = episode.interaction, stamps_of(episode.interaction.effect.times)[0]
     yield Said(first, "/view/height", make.image(first, ACTION, interaction.view.height))
@@ -172,7 +172,7 @@ def _bodies(episode: Episode, make: Messages, stamp: int) -> Iterator[Any]:
         yield make.solid(stamp, TOOL, "tool", id, part.shape, part.centre, part.size, part.colour)
 
 
-def _pictures(times: Float[np.ndarray, " time"], make: Messages, seen: Pictures | None) -> Iterator[Said]:
+def _images(times: Float[np.ndarray, " time"], make: Messages, seen: RenderedImages | None) -> Iterator[Said]:
     if seen is None:
         return
     for k, stamp in enumerate(stamps_of(times)):

@@ -3,7 +3,6 @@
 The camera frame has x to the right, y down and z forward. Pixels are (column, row) with centres at whole numbers.
 """
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from foretrace.errors import PerceptionError
+from foretrace.files import read_json, write_json
 from foretrace.geometry import transform_points
 
 FORMAT = "foretrace-camera"
@@ -51,7 +51,7 @@ class PinholeCamera:
         for name, size in (("cx", self.width), ("cy", self.height)):
             if not 0 <= getattr(self, name) < size:
                 raise PerceptionError(
-                    f"camera: {name} = {getattr(self, name)} lies outside a picture of {size} pixels: "
+                    f"camera: {name} = {getattr(self, name)} lies outside an image of {size} pixels: "
                     "check the order of the values"
                 )
         if len(self.distortion) not in DISTORTION_SIZES or not np.isfinite(self.distortion).all():
@@ -70,7 +70,7 @@ class PinholeCamera:
         return np.array(self.distortion or np.zeros(4), dtype=float)
 
     def scaled(self, factor: float) -> "PinholeCamera":
-        """The camera of pictures that are enlarged by a factor."""
+        """The camera of images that are enlarged by a factor."""
         size = (round(factor * self.width), round(factor * self.height))
         centre = (factor * (self.cx + 0.5) - 0.5, factor * (self.cy + 0.5) - 0.5)
         return PinholeCamera(*size, factor * self.fx, factor * self.fy, *centre, self.distortion)
@@ -123,17 +123,17 @@ class PinholeCamera:
         pixels = np.stack([columns, rows], axis=-1).astype(float)
         return transform_points(T_frame_camera, self.rays(pixels) * z[:, None])
 
-    def check_picture(self, picture: Shaped[np.ndarray, "rows columns *channels"], name: str) -> None:
-        """Refuse a picture that this camera cannot have taken.
+    def check_image(self, image: Shaped[np.ndarray, "rows columns *channels"], name: str) -> None:
+        """Refuse an image that this camera cannot have taken.
 
         Raises:
             PerceptionError: Its size is not the camera's.
         """
-        rows, columns = picture.shape[:2]
+        rows, columns = image.shape[:2]
         if (columns, rows) != (self.width, self.height):
             raise PerceptionError(
                 f"{name} has {columns} x {rows} pixels, the camera was calibrated for {self.width} x {self.height}: "
-                "calibrate with pictures of this size, or take the right camera file"
+                "calibrate with images of this size, or take the right camera file"
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -164,7 +164,7 @@ class PinholeCamera:
 
     def save(self, path: str | Path, **more: Any) -> None:
         """Write the camera as JSON, with further values beside it."""
-        Path(path).write_text(json.dumps({**self.to_dict(), **more}, indent=1) + "\n", encoding="utf-8")
+        write_json(Path(path), {**self.to_dict(), **more})
 
     @classmethod
     def load(cls, path: str | Path) -> "PinholeCamera":
@@ -173,10 +173,6 @@ class PinholeCamera:
         Raises:
             PerceptionError: The file is missing, damaged, or describes no camera.
         """
-        try:
-            values = json.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise PerceptionError(
-                f"camera file {path} cannot be read ({error}): make one with `foretrace calibrate`"
-            ) from error
-        return cls.from_dict(values, str(path))
+        return cls.from_dict(
+            read_json(Path(path), PerceptionError, "make one with `foretrace calibrate`"), str(path)
+        )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from foretrace.errors import DatasetError
+from foretrace.files import read_json
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 
@@ -32,17 +33,12 @@ def read_notes(folder: Path, id: int) -> dict[str, Any]:
         DatasetError: There is no such interaction, or its file is damaged.
     """
     path = folder / NOTES_FOLDER / f"{id:05d}.json"
-    try:
-        notes = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DatasetError(
-            f"{folder} has no recording {id}: give a data set that `foretrace import` made"
-        ) from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{path} cannot be read ({error}): import the film again") from error
+    if not path.is_file():
+        raise DatasetError(f"{folder} has no recording {id}: give a data set that `foretrace import` made")
+    notes = read_json(path, DatasetError, "import the recording again")
     for name, kind in NOTED.items():
-        if not isinstance(notes, dict) or not isinstance(notes.get(name), kind):
-            raise DatasetError(f"{path} does not tell the {name}: import the film again")
+        if not isinstance(notes.get(name), kind):
+            raise DatasetError(f"{path} lacks {name}: import the recording again")
     return notes
 
 

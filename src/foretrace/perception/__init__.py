@@ -1,1 +1,1 @@
-"""From pictures to views, and from films to interactions: calibration, masks, markers, recordings."""
+"""From images to views, and from recordings to interactions: calibration, masks, markers, recordings."""

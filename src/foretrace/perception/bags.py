@@ -1,4 +1,4 @@
-"""Films in bags of ROS 1 and ROS 2, read without ROS (``pip install foretrace[ros]``)."""
+"""Recordings in bags of ROS 1 and ROS 2, read without ROS (``pip install foretrace[ros]``)."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from foretrace.errors import PerceptionError
-from foretrace.interactions.film_folder import Frame
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.bag_pictures import is_depth, read_colour, read_depth
+from foretrace.interactions.recording_folder import Frame
+from foretrace.perception.bag_images import is_depth, read_colour, read_depth
 
-PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TOGETHER = 0.02
-"""Depth belongs to a colour picture taken at most so much earlier or later [s]."""
+"""Largest time between a colour image and the depth that belongs to it [s]."""
 PATIENCE = 0.5
-"""So long a colour picture waits for a depth picture that comes after it [s]."""
+"""Time for which a colour image waits for a later depth image [s]."""
 
 
 class _Stream(NamedTuple):
-    """A topic with pictures."""
+    """A topic with images."""
 
     depth: bool
     """Whether they are of depth."""
@@ -62,9 +62,9 @@ def open_bag(
 
 
 def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
-    """The topics with pictures, each by its first message; those without a message are left out."""
+    """The topics with images, each by its first message; those without a message are left out."""
     found: dict[str, _Stream] = {}
-    for topic in sorted({c.topic for c in reader.connections if c.msgtype in PICTURES}):
+    for topic in sorted({c.topic for c in reader.connections if c.msgtype in IMAGES}):
         for _, _, message in _messages(reader, path, [topic]):
             found[topic] = _Stream(is_depth(message), message.header.frame_id)
             break
@@ -164,7 +164,7 @@ def _frames(path: Path, colour: str, depth: str | None) -> Iterator[Frame]:
     def join(frame: Frame, after: tuple[float, np.ndarray] | None = None) -> Frame:
         near = [one for one in (before, after) if one is not None and abs(one[0] - frame.time) <= TOGETHER]
         nearest = min(near, key=lambda one: abs(one[0] - frame.time), default=(0.0, None))
-        return Frame(frame.time, frame.picture, nearest[1])
+        return Frame(frame.time, frame.image, nearest[1])
 
     with _reader(path) as reader:
         for topic, recorded, message in _messages(

@@ -1,4 +1,4 @@
-"""Calibrate a camera from pictures of a ChArUco board: a chessboard with a marker in every white square."""
+"""Calibrate a camera from images of a ChArUco board: a chessboard with a marker in every white square."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,33 +12,33 @@ from jaxtyping import Float, UInt8
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.recording_folder import read_image
 from foretrace.perception.markers import (
     Detections,
     MarkerBody,
     dictionary,
-    fitting_dictionaries,
     grey,
-    picture_fault,
+    image_fault,
     to_transform,
 )
 
-FEWEST_PICTURES = 5
-"""So many pictures that show the board are needed."""
+FEWEST_IMAGES = 5
+"""Least number of images that show the board."""
 FEWEST_CORNERS = 8
-"""A picture counts that shows at least so many inner corners of the board."""
+"""Least number of inner corners of the board in an image that counts."""
 LARGEST_ERROR = 1.0
-"""A calibration that misses the corners by more than this is refused [pixel]."""
+"""Largest reprojection error of a calibration [pixel]."""
 LOOSEST_FOCUS = 0.02
-"""A focal length less certain than by this part of it is not believed."""
+"""Largest relative standard deviation of a refined focal length."""
 FARTHEST_FOCUS = 0.2
-"""Nor one that is further from the stated one than this part of it."""
+"""Largest relative change of a refined focal length."""
 LEAST_TILT = np.deg2rad(10.0)
-"""Some pictures must see the board slanted by at least this, or the focal length stays unknown [rad]."""
+"""Least slant of the board in one of the images; without it the focal length stays unknown [rad]."""
 PAPER = 0.02
 """White margin round a printed board [m]."""
 INCH = 0.0254
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Pictures that are read."""
+"""Endings of image files."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Board:
         return self.squares[0] * self.square_length, self.squares[1] * self.square_length
 
     def draw(self, pixels_per_metre: float = 300 / INCH) -> UInt8[np.ndarray, "rows columns"]:
-        """The board as a picture, without a margin; at 300 dots per inch by default."""
+        """The board as an image, without a margin; at 300 dots per inch by default."""
         width, height = (round(length * pixels_per_metre) for length in self.size)
         return self._board.generateImage((width, height), marginSize=0)
 
@@ -95,15 +95,15 @@ class Board:
         if path.suffix.lower() not in (".png", ".pdf"):
             raise PerceptionError(f"cannot write a board to {path}: choose a name that ends in .png or .pdf")
         margin = round(PAPER * 300 / INCH)
-        picture = np.pad(self.draw(), margin, constant_values=255)
+        image = np.pad(self.draw(), margin, constant_values=255)
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path, dpi=(300, 300), resolution=300)
+        Image.fromarray(image).save(path, dpi=(300, 300), resolution=300)
 
     def find(
-        self, picture: UInt8[np.ndarray, "rows columns *channels"]
+        self, image: UInt8[np.ndarray, "rows columns *channels"]
     ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]:
         """Inner corners of the board [m] and where they were seen [pixel]; no rows where it was not."""
-        corners, ids, _, _ = self._detector.detectBoard(grey(picture))
+        corners, ids, _, _ = self._detector.detectBoard(grey(image))
         if ids is None or len(ids) == 0:
             return np.zeros((0, 3)), np.zeros((0, 2))
         known = np.asarray(self._board.getChessboardCorners(), dtype=float).reshape(-1, 3)
@@ -113,19 +113,19 @@ class Board:
 
     def pose(
         self,
-        picture: UInt8[np.ndarray, "rows columns *channels"],
+        image: UInt8[np.ndarray, "rows columns *channels"],
         camera: PinholeCamera,
-        name: str = "picture",
+        name: str = "image",
     ) -> Float[np.ndarray, "4 4"]:
         """T_board_camera: the camera's pose over a board that lies on the table, whose frame is the table frame.
 
         Raises:
-            PerceptionError: The picture is of another camera or does not show the board.
+            PerceptionError: The image is of another camera or does not show the board.
         """
-        camera.check_picture(picture, name)
-        points, pixels = self.find(picture)
+        camera.check_image(image, name)
+        points, pixels = self.find(image)
         if len(points) < FEWEST_CORNERS or not _spans_plane(points):
-            raise PerceptionError(f"{name} {self._what_is_missing(picture, len(points))}")
+            raise PerceptionError(f"{name} {self.what_is_missing(image)}")
         found, rvec, tvec = cv2.solvePnP(
             points, pixels, camera.matrix, camera.coefficients, flags=cv2.SOLVEPNP_IPPE
         )
@@ -134,19 +134,12 @@ class Board:
         rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, camera.coefficients, rvec, tvec)
         return invert_transform(to_transform(rvec, tvec))
 
-    def _what_is_missing(self, picture: UInt8[np.ndarray, "rows columns *channels"], found: int) -> str:
-        """Why a picture does not do, in words."""
-        if fault := picture_fault(picture):
-            return f"shows {found} corners of the board: {fault}"
-        fitting = fitting_dictionaries(picture)
-        if fitting and self.dictionary.lower() not in fitting:
-            return (
-                f"shows {found} corners of the board: its markers are of {fitting[0]}, not {self.dictionary}"
-            )
-        return (
-            f"shows {found} corners of the board, {FEWEST_CORNERS} over two rows are needed: show more of it, and "
-            "check squares and dictionary"
-        )
+    def what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
+        """Why an image does not show enough of the board, in words."""
+        found = f"shows {len(self.find(image)[0])} corners of the board"
+        if fault := image_fault(image, self.dictionary):
+            return f"{found}: {fault}"
+        return f"{found}, {FEWEST_CORNERS} over two rows are needed: show more of it, and check squares and dictionary"
 
     @cached_property
     def _board(self) -> cv2.aruco.CharucoBoard:
@@ -160,93 +153,92 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated camera, and how well it explains the pictures."""
+    """A calibrated camera, and how well it explains the images."""
 
     camera: PinholeCamera
     """The camera."""
     error: float
     """Root mean square of the reprojection error over all corners [pixel]."""
     errors: dict[str, float]
-    """The same for each picture that was used."""
+    """The same for each image that was used."""
     left_out: dict[str, str]
-    """Pictures that were not used, and why."""
+    """Images that were not used, and why."""
 
 
-def calibrate(
-    pictures: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board
-) -> Calibration:
-    """Focal lengths, centre and distortion (k1, k2, p1, p2, k3) from pictures of a board (Zhang, 2000).
+def calibrate(images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board) -> Calibration:
+    """Focal lengths, centre and distortion (k1, k2, p1, p2, k3) from images of a board (Zhang, 2000).
 
     Args:
-        pictures: Pictures by name, all of one size: the board from several sides, slanted, also in the corners.
+        images: Images by name, all of one size: the board from several sides, slanted, also in the corners.
         board: What they show.
 
     Raises:
-        PerceptionError: Too few pictures show the board, their sizes differ, none sees it slanted, or no camera
+        PerceptionError: Too few images show the board, their sizes differ, none shows it slanted, or no camera
             explains them.
     """
-    sizes = {name: (picture.shape[1], picture.shape[0]) for name, picture in pictures.items()}
-    if len(set(sizes.values())) > 1:
-        first, second = list(dict.fromkeys(sizes.values()))[:2]
-        odd = next(name for name, size in sizes.items() if size == second)
-        raise PerceptionError(
-            f"pictures of different sizes: {odd} has {second[0]} x {second[1]} pixels, others {first[0]} x {first[1]}: "
-            "calibrate with pictures of one camera at one resolution"
-        )
-    points, pixels, used, left_out = [], [], [], {}
-    for name, picture in pictures.items():
-        known, seen = board.find(picture)
-        if len(known) < FEWEST_CORNERS or not _spans_plane(known):
-            fault = picture_fault(picture)
-            left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
-            continue
-        points.append(known.astype(np.float32))
-        pixels.append(seen.astype(np.float32))
-        used.append(name)
-    if len(used) < FEWEST_PICTURES:
+    points, pixels, left_out = _find_corners(images, board)
+    if len(points) < FEWEST_IMAGES:
         odd = next(iter(left_out), "")
-        reason = (
-            f"; {odd} {board._what_is_missing(pictures[odd], len(board.find(pictures[odd])[0]))}"
-            if odd
-            else ""
-        )
+        reason = f"; {odd} {board.what_is_missing(images[odd])}" if odd else ""
         raise PerceptionError(
-            f"{len(used)} of {len(pictures)} pictures show the board, {FEWEST_PICTURES} are needed{reason}"
+            f"{len(points)} of {len(images)} images show the board, {FEWEST_IMAGES} are needed{reason}"
         )
-    size = next(iter(sizes.values()))
+    rows, columns = next(iter(images.values())).shape[:2]
+    size = columns, rows
     error, matrix, distortion, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
-        points, pixels, size, np.eye(3), np.zeros(5)
+        list(points.values()), list(pixels.values()), size, np.eye(3), np.zeros(5)
     )
     tilts = [
         np.arccos(np.clip(abs(to_transform(r, t)[2, 2]), 0, 1)) for r, t in zip(rvecs, tvecs, strict=True)
     ]
     if max(tilts) < LEAST_TILT:
         raise PerceptionError(
-            f"no picture sees the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
-            "the focal length cannot be told from that; tilt the board or the camera by 20 to 45 degrees"
+            f"no image shows the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
+            "that leaves the focal length open; tilt the board or the camera by 20 to 45 degrees"
         )
     if not error <= LARGEST_ERROR:
         raise PerceptionError(
-            f"no camera explains the pictures: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
+            f"no camera explains the images: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
             "accepted; check squares and flatness of the board, and that zoom and focus are fixed"
         )
-    camera = PinholeCamera(
-        *size,
-        matrix[0, 0],
-        matrix[1, 1],
-        matrix[0, 2],
-        matrix[1, 2],
-        tuple(np.ravel(distortion)[:5].tolist()),
-    )
-    errors = {
-        name: float(np.sqrt((np.linalg.norm(camera.project(p, to_transform(r, t)) - q, axis=1) ** 2).mean()))
-        for name, p, q, r, t in zip(used, points, pixels, rvecs, tvecs, strict=True)
-    }
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    camera = PinholeCamera(*size, fx, fy, cx, cy, tuple(np.ravel(distortion)[:5].tolist()))
+    errors = {}
+    for name, rvec, tvec in zip(points, rvecs, tvecs, strict=True):
+        miss = camera.project(points[name], to_transform(rvec, tvec)) - pixels[name]
+        errors[name] = float(np.sqrt((np.linalg.norm(miss, axis=1) ** 2).mean()))
     return Calibration(camera, float(error), errors, left_out)
 
 
-def read_pictures(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "rows columns 3"]]:
-    """Pictures by name, blue-green-red; folders stand for the pictures in them.
+def _find_corners(
+    images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, str]]:
+    """Corners of the board and their pixels in the images that show it; why the other images do not.
+
+    Raises:
+        PerceptionError: The images differ in size.
+    """
+    sizes = {name: f"{image.shape[1]} x {image.shape[0]}" for name, image in images.items()}
+    if len(set(sizes.values())) > 1:
+        first, second = list(dict.fromkeys(sizes.values()))[:2]
+        odd = next(name for name, size in sizes.items() if size == second)
+        raise PerceptionError(
+            f"images of different sizes: {odd} has {second} pixels, others {first}: calibrate with images of "
+            "one camera at one resolution"
+        )
+    points, pixels, left_out = {}, {}, {}
+    for name, image in images.items():
+        known, seen = board.find(image)
+        if len(known) < FEWEST_CORNERS or not _spans_plane(known):
+            fault = image_fault(image)
+            left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
+            continue
+        points[name], pixels[name] = known.astype(np.float32), seen.astype(np.float32)
+    return points, pixels, left_out
+
+
+def read_images(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "rows columns 3"]]:
+    """Images by name, blue-green-red; folders stand for the images in them.
 
     Raises:
         PerceptionError: One is missing or cannot be read, or there is none.
@@ -260,20 +252,8 @@ def read_pictures(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "r
         )
         files += inside
     if not files:
-        raise PerceptionError(f"no picture in {', '.join(map(str, paths))}: give {', '.join(SUFFIXES)} files")
-    return {str(file): read_picture(file) for file in files}
-
-
-def read_picture(path: str | Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """A picture as blue, green and red.
-
-    Raises:
-        PerceptionError: It is missing or cannot be read.
-    """
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
-    if picture is None:
-        raise PerceptionError(f"cannot read a picture from {path}: give a whole PNG or JPEG file")
-    return picture
+        raise PerceptionError(f"no image in {', '.join(map(str, paths))}: give {', '.join(SUFFIXES)} files")
+    return {str(file): read_image(file) for file in files}
 
 
 def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
@@ -286,12 +266,12 @@ def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
 def refine_camera(
     detections: Sequence[Detections], body: MarkerBody, camera: PinholeCamera
 ) -> tuple[PinholeCamera, float]:
-    """The camera whose focal lengths and first radial distortion explain best how known markers look.
+    """The camera whose focal lengths and first radial distortion fit images of known markers best.
 
-    For pictures that were taken or straightened with a camera file that is not quite theirs. A board tells more.
+    For images with a camera file that is not quite theirs. Images of a board give a better calibration.
 
     Args:
-        detections: The markers in each picture; the body must be seen from several sides.
+        detections: The markers in each image; the body must be seen from several sides.
         body: The markers.
         camera: The camera as far as it is known.
 
@@ -299,13 +279,11 @@ def refine_camera(
         The camera, and the root mean square of the reprojection error that remains [pixel].
 
     Raises:
-        PerceptionError: The pictures do not tell: too few, or too much alike.
+        PerceptionError: There are too few images, or they are too much alike.
     """
     matches = [match for seen in detections if len((match := body.matches(seen))[0])]
-    if len(matches) < FEWEST_PICTURES:
-        raise PerceptionError(
-            f"markers {body.ids} are in {len(matches)} pictures, {FEWEST_PICTURES} are needed"
-        )
+    if len(matches) < FEWEST_IMAGES:
+        raise PerceptionError(f"markers {body.ids} are in {len(matches)} images, {FEWEST_IMAGES} are needed")
     if len(camera.distortion) > 5:
         raise PerceptionError(
             "a camera with 8 distortion coefficients cannot be refined: calibrate it with a board"
@@ -320,7 +298,7 @@ def refine_camera(
     loose = np.ravel(deviations)[:2].max() > LOOSEST_FOCUS * camera.fx
     if not np.isfinite(error) or loose or abs(matrix[0, 0] / camera.fx - 1) > FARTHEST_FOCUS:
         raise PerceptionError(
-            f"{len(matches)} pictures of markers {body.ids} leave the focal length open: slant them more, both ways"
+            f"{len(matches)} images of markers {body.ids} leave the focal length open: slant them more, both ways"
         )
     fx, fy = (float(matrix[k, k]) for k in (0, 1))
     found = tuple(float(value) for value in np.ravel(lens)[:5])

@@ -1,74 +1,81 @@
-"""From a film to an interaction: the object on the table, its path, the view of it, and what became of it."""
+"""From a recording to an interaction: the object on the table, its path, the view of it, and what became of it."""
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from foretrace.actions import LeverUp, Stroke, ToolPath
 from foretrace.errors import PerceptionError
-from foretrace.geometry import continuous_quaternions, invert_transform, matrix_to_pose, transform_points
-from foretrace.interactions.film_folder import Frame
+from foretrace.files import versions_of
+from foretrace.geometry import (
+    continuous_quaternions,
+    invert_transform,
+    matrix_to_pose,
+    planar_transform,
+    transform_points,
+)
 from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Effect, Interaction, Provenance
-from foretrace.interactions.topdown import MINIMAL_HEIGHT
+from foretrace.interactions.recording_folder import Frame
 from foretrace.objects import BEVEL, ObjectModel
-from foretrace.perception.films import Film
 from foretrace.perception.markers import (
     Detections,
     MarkerLayout,
     align_patterns,
     detect_markers,
-    fitting_dictionaries,
-    picture_fault,
+    image_fault,
 )
-from foretrace.perception.masks import (
-    cover_by_background,
-    cover_of,
-    heights_above_table,
-    mask_by_height,
-    pick_object,
+from foretrace.perception.masks import DEPTH_RIM, find_by_background, find_by_height, heights_above_table
+from foretrace.perception.recordings import Recording
+from foretrace.perception.tracking import Track, TrackConfig, check_times, still_pose, track
+from foretrace.perception.views import (
+    Observation,
+    PlacedObject,
+    contact_at_pixel,
+    fit_object,
+    observe,
+    place_object,
 )
-from foretrace.perception.tracking import Track, TrackConfig, slerp, still_pose, track
-from foretrace.perception.views import PlacedObject, Sight, contact_at_pixel, fit_object, place_object, see
+from foretrace.trajectories import interpolate_poses
 
 ONSET = 0.407
-"""Time from the start of the blade's usual path until the object has moved by a millimetre [s]: the median of the
+"""Time from the start of the blade's nominal path until the object has moved by a millimetre [s]: the median of the
 simulated lever-ups, whose standard deviation is 0.016 s."""
 ONSET_SHIFT = 0.001
 """How far that is [m]."""
 REST_TIME = 0.2
-"""So long the object must be seen at rest before it moves [s]."""
-TABLE_LOOKS = 15
+"""Least time for which the object lies at rest before it moves [s]."""
+TABLE_FRAMES = 15
 """Frames whose table markers are measured with care; the camera stands still."""
 LEAST_LEVEL = 0.03
-"""A marker's height on an object may err by this much before the film is refused [m]."""
+"""A marker's height on an object may err by this much before the recording is refused [m]."""
 
 
 @dataclass(frozen=True)
 class ImportConfig:
-    """How films become interactions."""
+    """How recordings become interactions."""
 
     track: TrackConfig = field(default_factory=TrackConfig)
     """How markers are followed."""
     path: ToolPath = field(default_factory=ToolPath)
-    """The blade's path, as planned; it is recorded as the tool's, since nobody filmed it."""
+    """The blade's path, as planned; it is recorded as the tool's, which no camera measures."""
     sample_period: float = 0.05
     """Time between the samples of the interaction [s]: that of the data that it joins."""
     start: float | None = None
-    """Time stamp at which the blade's path starts [s]; by default the film's note, else from the object's motion."""
+    """Time stamp at which the blade's path starts [s]; by default as noted, else from the motion."""
     height: float | None = None
     """Height of an object of unknown shape [m]; by default that of its marker above the table."""
     shadows: bool = True
-    """Whether there may be shadows, which are then told from the object."""
+    """Whether there may be shadows, which are then separated from the object."""
 
     def __post_init__(self) -> None:
         if self.start is not None and not np.isfinite(self.start):
-            raise PerceptionError(f"start = {self.start}: give a time stamp of the film in seconds")
+            raise PerceptionError(f"start = {self.start}: give a time stamp of the recording in seconds")
 
 
 @dataclass(frozen=True)
@@ -85,7 +92,7 @@ class Contact:
     def __post_init__(self) -> None:
         if sum(value is not None for value in (self.point, self.pixel, self.edge)) != 1:
             raise PerceptionError(
-                "say where the object is levered: give exactly one of point, pixel and edge"
+                "the contact is given in no way, or in several: give exactly one of point, pixel and edge"
             )
 
 
@@ -95,7 +102,7 @@ class Imported:
 
     interaction: Interaction
     """The interaction."""
-    sight: Sight
+    observation: Observation
     """Object, action and view."""
     track: Track
     """The path of the object's markers in the camera frame, frame by frame."""
@@ -109,21 +116,21 @@ class Imported:
     @property
     def T_action_camera(self) -> Float[np.ndarray, "4 4"]:
         """The camera in the action frame."""
-        return invert_transform(self.sight.T_table_action) @ self.T_table_camera
+        return invert_transform(self.observation.T_table_action) @ self.T_table_camera
 
 
-def import_film(
-    film: Film,
+def import_recording(
+    recording: Recording,
     camera: PinholeCamera,
     layout: MarkerLayout,
     contact: Contact,
     shape: ObjectModel | None = None,
     config: ImportConfig = ImportConfig(),
 ) -> Imported:
-    """Turns a film of one lever-up into an interaction.
+    """Turn the recording of one lever-up into an interaction.
 
     Args:
-        film: The film; its first frames show the object at rest.
+        recording: The recording; its first frames show the object at rest.
         camera: The calibrated camera, which stands still.
         layout: The markers on table and object.
         contact: Where the object is levered.
@@ -131,9 +138,9 @@ def import_film(
         config: How.
 
     Raises:
-        PerceptionError: The film does not tell the interaction: no markers, too large a gap, no rest, no mask...
+        PerceptionError: The recording does not tell the interaction: no markers, too large a gap, no rest, no mask...
     """
-    first, times, detections = _look_through(film, camera, layout)
+    first, times, detections = _detect_all(recording, camera, layout)
     T_table_camera = invert_transform(
         still_pose(_careful(detections, layout), layout.table, camera, config.track)
     )
@@ -141,20 +148,20 @@ def import_film(
     T_table_body = T_table_camera @ followed.T_camera_body
     at_rest = _rest(times, T_table_body)
     T_table_start = _mean_transform(T_table_body[at_rest])
-    placed = _place(first, film, camera, layout, T_table_camera, T_table_start, shape, config)
+    placed = _place(first, recording, camera, layout, T_table_camera, T_table_start, shape, config)
     T_table_object = T_table_body @ (invert_transform(T_table_start) @ placed.T_table_object)
-    sight = see_contact(placed, contact, camera, T_table_camera)
-    start = config.start if config.start is not None else film.notes.action_start
+    observation = observe_contact(placed, contact, camera, T_table_camera)
+    start = config.start if config.start is not None else recording.notes.action_start
     com = placed.object.mass_properties(1.0).com
     if start is None:
         start = _onset(times, transform_points(T_table_object, com[None])[:, 0], at_rest) - ONSET
-    interaction = _record(times, T_table_object, sight, start, config, followed)
-    return Imported(interaction, sight, followed, T_table_camera, T_table_object, start)
+    interaction = _record(times, T_table_object, observation, start, config, followed)
+    return Imported(interaction, observation, followed, T_table_camera, T_table_object, start)
 
 
-def see_contact(
+def observe_contact(
     placed: PlacedObject, contact: Contact, camera: PinholeCamera, T_table_camera: Float[np.ndarray, "4 4"]
-) -> Sight:
+) -> Observation:
     """The lever-up that a contact means.
 
     Raises:
@@ -163,62 +170,54 @@ def see_contact(
     """
     if contact.edge is not None:
         action = LeverUp.at_edge(placed.object, *contact.edge)
-        return see(placed, action.contact)
+        return observe(placed, action.contact)
     if contact.pixel is not None:
-        return see(placed, contact_at_pixel(placed, contact.pixel, camera, T_table_camera))
-    return see(placed, np.array(contact.point, dtype=float))
+        return observe(placed, contact_at_pixel(placed, contact.pixel, camera, T_table_camera))
+    return observe(placed, np.array(contact.point, dtype=float))
 
 
-def _look_through(
-    film: Film, camera: PinholeCamera, layout: MarkerLayout
+def _detect_all(
+    recording: Recording, camera: PinholeCamera, layout: MarkerLayout
 ) -> tuple[list[Frame], Float[np.ndarray, " frame"], list[Detections]]:
     """The first frame, and times and markers of all."""
     first, times, detections = [], [], []
     table, thing = set(layout.table.ids), set(layout.object.ids)
     hopeless = None
-    for number, frame in enumerate(film.frames()):
-        camera.check_picture(frame.picture, f"frame {number} of {film.path}")
-        if times and frame.time <= times[-1]:
-            raise PerceptionError(
-                f"time stamps of {film.path} do not increase: frame {number} at {frame.time:.6f} s follows "
-                f"{times[-1]:.6f} s; sort or film again"
-            )
+    for number, frame in enumerate(recording.frames()):
+        camera.check_image(frame.image, f"frame {number} of {recording.path}")
         if frame.depth is not None:
-            camera.check_picture(frame.depth, f"depth picture {number} of {film.path}")
-        seen = detect_markers(frame.picture, layout.dictionary)
-        wanted = thing | table if number < TABLE_LOOKS else thing
-        detections.append(align_patterns(frame.picture, seen, layout.dictionary, wanted))
+            camera.check_image(frame.depth, f"depth image {number} of {recording.path}")
+        seen = detect_markers(frame.image, layout.dictionary)
+        wanted = thing | table if number < TABLE_FRAMES else thing
+        detections.append(align_patterns(frame.image, seen, layout.dictionary, wanted))
         times.append(frame.time)
         first = first or [frame]
         if hopeless is None and not (table | thing) & set(seen.ids.tolist()):
-            hopeless = frame.picture
+            hopeless = frame.image
+    check_times(np.array(times), f" of {recording.path}")
     for name, ids in (("object", thing), ("table", table)):
         count = sum(bool(ids & set(seen.ids.tolist())) for seen in detections)
         if count < 2:
             raise PerceptionError(
-                f"the {name}'s markers {sorted(ids)} are seen in {count} of {len(times)} frames of {film.path}: "
-                f"{_excuse(first[0].picture if hopeless is None else hopeless, layout)}"
+                f"the {name}'s markers {sorted(ids)} are seen in {count} of {len(times)} frames of {recording.path}: "
+                f"{_excuse(first[0].image if hopeless is None else hopeless, layout)}"
             )
     return first, np.array(times), detections
 
 
-def _excuse(picture: UInt8[np.ndarray, "rows columns 3"], layout: MarkerLayout) -> str:
-    """Why markers may not have been found in a picture."""
-    if fault := picture_fault(picture):
-        return fault
-    fitting = [name for name in fitting_dictionaries(picture) if name != layout.dictionary.lower()]
-    here = detect_markers(picture, layout.dictionary).ids.tolist()
-    if here:
+def _excuse(image: UInt8[np.ndarray, "rows columns 3"], layout: MarkerLayout) -> str:
+    """Why markers may not have been found in an image."""
+    if here := detect_markers(image, layout.dictionary).ids.tolist():
         return f"seen are {sorted(here)}; check the ids in the marker layout"
-    if fitting:
-        return f"the picture has markers of {fitting[0]}; check the dictionary in the marker layout"
-    return "no marker of any known dictionary is in the picture; bring it nearer or light it better"
+    return image_fault(image, layout.dictionary) or (
+        "no marker of any known dictionary is in the image; bring it nearer or light it better"
+    )
 
 
 def _careful(detections: Sequence[Detections], layout: MarkerLayout) -> list[Detections]:
     """The frames in which the table is looked at: the first that show it."""
     wanted = set(layout.table.ids)
-    return [seen for seen in detections[:TABLE_LOOKS] if wanted & set(seen.ids.tolist())] or list(detections)
+    return [seen for seen in detections[:TABLE_FRAMES] if wanted & set(seen.ids.tolist())] or list(detections)
 
 
 def _rest(
@@ -231,24 +230,23 @@ def _rest(
     shift = np.linalg.norm(T_table_body[early, :3, 3] - T_table_body[early][0, :3, 3], axis=1)
     if early.sum() < 2 or shift.max() > 3 * ONSET_SHIFT:
         raise PerceptionError(
-            f"the object moves by {1e3 * shift.max(initial=0):.1f} mm in the film's first {REST_TIME} s: start filming "
-            "before the blade touches it"
+            f"the object moves by {1e3 * shift.max(initial=0):.1f} mm in the recording's first {REST_TIME} s: start "
+            "recording before the blade touches it"
         )
     return early
 
 
 def _mean_transform(transforms: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The mean of poses that are nearly alike."""
+    """Mean of poses that are nearly alike."""
     mean = np.eye(4)
-    u, _, vt = np.linalg.svd(transforms[:, :3, :3].mean(axis=0))
-    mean[:3, :3] = u @ vt
+    mean[:3, :3] = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
     mean[:3, 3] = transforms[:, :3, 3].mean(axis=0)
     return mean
 
 
 def _place(
     first: Sequence[Frame],
-    film: Film,
+    recording: Recording,
     camera: PinholeCamera,
     layout: MarkerLayout,
     T_table_camera: Float[np.ndarray, "4 4"],
@@ -269,51 +267,46 @@ def _place(
         )
     middle = camera.project(T_table_body[None, :3, 3], invert_transform(T_table_camera))[0]
     point = float(middle[0]), float(middle[1])
-    mask, rim = find_mask(first[0], film, camera, T_table_camera, point, config.shadows)
+    mask, rim = find_mask(first[0], recording, camera, T_table_camera, point, config.shadows)
     seen = place_object(mask, camera, T_table_camera, height, min(rim, 0.5 * height))
     return seen if shape is None else fit_object(seen, shape)
 
 
 def find_mask(
     frame: Frame,
-    film: Film,
+    recording: Recording,
     camera: PinholeCamera,
     T_table_camera: Float[np.ndarray, "4 4"],
     point: tuple[float, float],
     shadows: bool = True,
 ) -> tuple[Bool[np.ndarray, "rows columns"] | Float[np.ndarray, "rows columns"], float]:
-    """The object in the first frame by the film's background or its depth, and where above the table it begins [m].
+    """The object in the first frame, by the recording's background or its depth, and the height of its rim [m].
 
-    By the background: which part of each pixel it covers. By depth where the background does not tell.
+    By background: which part of each pixel it covers. By depth where the background does not tell.
 
     Raises:
-        PerceptionError: The film has neither, or what it has does not tell.
+        PerceptionError: The recording has neither, or what it has does not tell.
     """
-    background = film.background()
+    background = recording.background()
     if background is not None:
         try:
-            cover = cover_by_background(frame.picture, background, shadows=shadows)
-            return cover_of(cover, pick_object(cover > 0.5, point)), BEVEL.height
+            return find_by_background(frame.image, background, point, shadows), BEVEL.height
         except PerceptionError as error:
             if frame.depth is None:
                 raise
             warnings.warn(f"the object is found by depth, since by background: {error}", stacklevel=2)
     if frame.depth is not None:
-        heights = heights_above_table(frame.depth, camera, T_table_camera)
-        return pick_object(mask_by_height(heights), point), 2 * MINIMAL_HEIGHT
+        return find_by_height(heights_above_table(frame.depth, camera, T_table_camera), point), DEPTH_RIM
     raise PerceptionError(
-        f"{film.path} has neither background.png nor depth to find the object by: film the empty table, or say where "
-        "the marker sits on the object with object_pose in the marker layout"
+        f"{recording.path} has neither background.png nor depth to find the object by: record the empty table, or "
+        "give object_pose, the marker's place on the object, in the marker layout"
     )
 
 
 def level(T_table_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The pose of an object that lies flat on the table, nearest to a measured one."""
     angle = np.arctan2(T_table_object[1, 0], T_table_object[0, 0])
-    flat = np.eye(4)
-    flat[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    flat[:2, 3] = T_table_object[:2, 3]
-    return flat
+    return planar_transform(T_table_object[:2, 3], float(angle))
 
 
 def _onset(
@@ -332,7 +325,7 @@ def _onset(
     k = int(moved.argmax())
     if k == 0:
         raise PerceptionError(
-            "the object moves from the first frame on: start filming before the blade touches it"
+            "the object moves from the first frame on: start recording before the blade touches it"
         )
     share = (ONSET_SHIFT - shift[k - 1]) / max(shift[k] - shift[k - 1], 1e-9)
     return float(times[k - 1] + np.clip(share, 0, 1) * (times[k] - times[k - 1]))
@@ -341,7 +334,7 @@ def _onset(
 def _record(
     times: Float[np.ndarray, " frame"],
     T_table_object: Float[np.ndarray, "frame 4 4"],
-    sight: Sight,
+    observation: Observation,
     start: float,
     config: ImportConfig,
     followed: Track,
@@ -352,28 +345,26 @@ def _record(
     grid = grid[: int(np.searchsorted(grid, times[-1] - start + 1e-6, side="right"))]
     if len(grid) < 2 or start + grid[-1] < start + config.path.lift_start:
         raise PerceptionError(
-            f"the film ends {times[-1] - start:.2f} s after the blade starts, before the lift: film to the end"
+            f"the recording ends {times[-1] - start:.2f} s after the blade starts, before the lift: record to the end"
         )
     if start < times[0] - ONSET:
         raise PerceptionError(
-            f"the blade starts at {start:.2f} s, the film at {times[0]:.2f} s: the object was not filmed at rest"
+            f"the blade starts at {start:.2f} s, the recording at {times[0]:.2f} s: the object was not recorded at rest"
         )
     for begin, end in followed.gaps():
         if end >= start and begin <= start + grid[-1]:
             raise PerceptionError(
                 f"the object's markers are not seen from {begin:.2f} to {end:.2f} s, longer than the "
-                f"{config.track.largest_gap} s that are bridged: covered, or seen too flatly; film again from elsewhere"
+                f"{config.track.largest_gap} s that are bridged: covered, or seen too flatly; record "
+                "again from elsewhere"
             )
-    T_action_table = invert_transform(sight.T_table_action)
+    T_action_table = invert_transform(observation.T_table_action)
     there = np.isfinite(T_table_object[:, 0, 0])
     known = T_action_table @ T_table_object[there]
-    stamps = times[there] - start
-    poses = np.tile(np.eye(4), (len(grid), 1, 1))
-    poses[:, :3, 3] = np.column_stack([np.interp(grid, stamps, known[:, i, 3]) for i in range(3)])
-    poses[:, :3, :3] = slerp(stamps, known[:, :3, :3], grid)
+    poses = interpolate_poses(times[there] - start, known, grid)
     trajectory = matrix_to_pose(poses)
     trajectory[:, 3:] = continuous_quaternions(trajectory[:, 3:])
-    obj = sight.placed.object
+    obj = observation.placed.object
     com = transform_points(poses, obj.mass_properties(1.0).com[None])[:, 0]
     outcome, slip = judge_motion(obj, trajectory, com)
     x, z, pitch = config.path.at(grid).T
@@ -390,8 +381,12 @@ def _record(
         outcome=outcome,
         slip_index=slip,
     )
-    versions = {name: version(name) for name in ("foretrace", "numpy")}
-    provenance = Provenance(source="recorded", engine="", versions=versions)
+    provenance = Provenance(source="recorded", engine="", versions=versions_of("foretrace", "numpy"))
     return Interaction(
-        obj, sight.action, sight.view, effect, provenance=provenance, stroke=Stroke.of(config.path)
+        obj,
+        observation.action,
+        observation.view,
+        effect,
+        provenance=provenance,
+        stroke=Stroke.of(config.path),
     )

@@ -1,10 +1,9 @@
-"""Square markers: which are in a picture, and where a body that carries them is.
+"""Square markers: which are in an image, and where a body that carries them is.
 
 A marker's frame has its origin in the marker's middle, x to the right and y up as one reads it, z out of it. A flat
 square has two poses that look nearly alike from afar; both are kept, for only time can tell them apart.
 """
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
 
 from foretrace.errors import PerceptionError
-from foretrace.geometry import invert_transform, transform_points
+from foretrace.files import read_versioned
+from foretrace.geometry import invert_transform, planar_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
 
 FORMAT = "foretrace-markers"
@@ -35,36 +35,36 @@ DICTIONARIES: dict[str, int] = {
 }
 """OpenCV's dictionaries by the names that users give."""
 DARK = 25
-"""A picture whose brightest hundredth is below this grey value is dark (of 255)."""
+"""An image whose brightest hundredth is below this grey value is dark (of 255)."""
 BLURRED = 15.0
-"""A picture whose Laplacian varies by less than this has no sharp edge (grey values squared)."""
+"""An image whose Laplacian varies by less than this has no sharp edge (grey values squared)."""
 SMALLEST_SIDE = 10.0
-"""A marker of fewer pixels along its shortest side tells no pose."""
+"""Least length of the shortest side of a marker whose pose is measured [pixel]."""
 LEAST_SLANT = np.deg2rad(15.0)
-"""A marker that is looked at more flatly than this tells no pose: its two poses look alike, its pattern blurs [rad]."""
+"""Least angle between marker and line of sight: below, its two poses look alike and its pattern blurs [rad]."""
 
 CELL = 16
 """Pixels along a module of the pattern that is drawn."""
 OVERSAMPLING = 4
-"""It is drawn with so many times the picture's pixels, then averaged."""
+"""Pixels of the drawing along a pixel of the image, which are averaged."""
 BLUR = 0.8
 """Standard deviation of what lens and sensor blur [pixel]."""
 BORDER = 6
-"""Pixels round a marker that are looked at."""
+"""Pixels round a marker that take part."""
 LARGEST_ALIGNMENT = 6.0
-"""Alignment that moves a corner further than this has gone astray [pixel]."""
+"""Largest shift of a corner by an alignment that has not gone astray [pixel]."""
 LEAST_CORRELATION = 0.7
-"""A picture that resembles the pattern less shows the marker covered or smeared."""
+"""An image that resembles the pattern less shows the marker covered or smeared."""
 
 
 @dataclass(frozen=True)
 class Detections:
-    """The markers seen in one picture."""
+    """The markers seen in one image."""
 
     ids: Int[np.ndarray, " markers"]
     """Their numbers."""
     corners: Float[np.ndarray, "markers 4 2"]
-    """Their corners in the picture [pixel], clockwise as one reads the marker, from its upper left."""
+    """Their corners in the image [pixel], clockwise as one reads the marker, from its upper left."""
 
     def of(self, id: int) -> Float[np.ndarray, "4 2"] | None:
         """The corners of one marker, or None where it was not seen, or seen twice."""
@@ -97,9 +97,9 @@ def _detector(name: str) -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(dictionary(name), parameters)
 
 
-def detect_markers(picture: UInt8[np.ndarray, "rows columns *channels"], name: str) -> Detections:
-    """The markers of a dictionary in a picture (grey, or blue-green-red as OpenCV reads it)."""
-    corners, ids, _ = _detector(name.lower()).detectMarkers(grey(picture))
+def detect_markers(image: UInt8[np.ndarray, "rows columns *channels"], name: str) -> Detections:
+    """The markers of a dictionary in an image (grey, or blue-green-red as OpenCV reads it)."""
+    corners, ids, _ = _detector(name.lower()).detectMarkers(grey(image))
     if ids is None or len(ids) == 0:
         return Detections(np.zeros(0, dtype=int), np.zeros((0, 4, 2)))
     # OpenCV 4 gives ids as (n, 1), OpenCV 5 as (n,).
@@ -107,23 +107,23 @@ def detect_markers(picture: UInt8[np.ndarray, "rows columns *channels"], name: s
 
 
 def align_patterns(
-    picture: UInt8[np.ndarray, "rows columns *channels"],
+    image: UInt8[np.ndarray, "rows columns *channels"],
     detections: Detections,
     name: str,
     only: Collection[int] | None = None,
 ) -> Detections:
     """Corners found anew from all of each marker's pattern, not from its outer rim alone; slower.
 
-    The known pattern, blurred as far as a pixel blurs, is aligned with the picture (Evangelidis and Psarakis, 2008); a
+    The known pattern, blurred as far as a pixel blurs, is aligned with the image (Evangelidis and Psarakis, 2008); a
     marker that cannot be aligned is covered or smeared, and left out.
 
     Args:
-        picture: The picture.
+        image: The image.
         detections: What was detected in it.
         name: The markers' dictionary.
         only: Markers to treat; others are left out. By default all.
     """
-    values, found = grey(picture), dictionary(name)
+    values, found = grey(image), dictionary(name)
     kept, aligned = [], []
     for id, corners in zip(detections.ids, detections.corners, strict=True):
         if only is not None and id not in only:
@@ -143,7 +143,7 @@ def _align(
     id: int,
     corners: Float[np.ndarray, "4 2"],
 ) -> Float[np.ndarray, "4 2"] | None:
-    """A marker's corners after aligning the picture with the pattern drawn as a camera would see it there."""
+    """A marker's corners after aligning the image with the pattern drawn as a camera would see it there."""
     modules = found.markerSize + 2  # the code and its black rim
     marker = cv2.aruco.generateImageMarker(found, id, CELL * modules, borderBits=1)
     pattern = np.pad(marker, CELL, constant_values=255)
@@ -177,33 +177,41 @@ def _align(
     return cv2.perspectiveTransform((corners - low)[None], back)[0].astype(float) + low
 
 
-def grey(picture: Shaped[np.ndarray, "rows columns *channels"]) -> UInt8[np.ndarray, "rows columns"]:
-    """A picture in grey."""
-    return picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+def grey(image: Shaped[np.ndarray, "rows columns *channels"]) -> UInt8[np.ndarray, "rows columns"]:
+    """An image in grey."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
-def fitting_dictionaries(picture: UInt8[np.ndarray, "rows columns *channels"]) -> list[str]:
-    """Dictionaries with markers in the picture, those with most first; of nested ones the smallest."""
+def fitting_dictionaries(image: UInt8[np.ndarray, "rows columns *channels"]) -> list[str]:
+    """Dictionaries with markers in the image, those with most first; of nested ones the smallest."""
     counts: dict[str, int] = {}
     for name in DICTIONARIES:
         family, _, size = name.partition("_")
         nested = "x" in family
         if nested and size != "1000":  # they are the beginnings of the largest
             continue
-        if len(ids := detect_markers(picture, name).ids):
+        if len(ids := detect_markers(image, name).ids):
             smallest = min(count for count in (50, 100, 250, 1000) if ids.max() < count) if nested else 0
             counts[f"{family}_{smallest}" if nested else name] = len(ids)
     return sorted(counts, key=lambda name: -counts[name])
 
 
-def picture_fault(picture: UInt8[np.ndarray, "rows columns *channels"]) -> str:
-    """What may keep markers from being found in a picture, in words; empty if nothing is apparent."""
-    values = grey(picture)
+def image_fault(image: UInt8[np.ndarray, "rows columns *channels"], name: str | None = None) -> str:
+    """What may keep markers from being found in an image, in words; empty if nothing is apparent.
+
+    Args:
+        image: The image.
+        name: Dictionary of the markers; if given, an image with markers of other dictionaries alone is at fault.
+    """
+    values = grey(image)
     if np.percentile(values, 99) < DARK:
         return f"it is dark (99 % of the pixels are below {np.percentile(values, 99):.0f} of 255)"
     sharpness = float(cv2.Laplacian(values, cv2.CV_64F).var())
     if sharpness < BLURRED:
         return f"it is blurred or empty (its Laplacian varies by {sharpness:.1f}, below {BLURRED:g})"
+    fitting = [] if name is None else fitting_dictionaries(image)
+    if fitting and name is not None and name.lower() not in fitting:
+        return f"its markers are of {fitting[0]}, not {name}: check the dictionary"
     return ""
 
 
@@ -308,7 +316,7 @@ class MarkerLayout:
     object: MarkerBody
     """Markers on the object, in a frame of their own unless `T_object_body` is known."""
     T_object_body: Float[np.ndarray, "4 4"] | None = None
-    """Where that frame lies on the object; None: to be found from the picture."""
+    """Where that frame lies on the object; None: to be found from the image."""
 
     @classmethod
     def load(cls, path: str | Path) -> "MarkerLayout":
@@ -317,14 +325,8 @@ class MarkerLayout:
         Raises:
             PerceptionError: The file is missing or is no such layout.
         """
-        try:
-            values = json.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise PerceptionError(f"marker layout {path} cannot be read ({error})") from error
-        if not isinstance(values, dict) or values.get("format") != FORMAT or values.get("version") != VERSION:
-            raise PerceptionError(
-                f'{path} is no marker layout: it lacks "format": "{FORMAT}", "version": {VERSION}'
-            )
+        remedy = "give a marker layout with its dictionary, table and object"
+        values = read_versioned(Path(path), FORMAT, VERSION, PerceptionError, remedy, key="version")
         try:
             bodies = {name: _read_body(values[name]) for name in ("table", "object")}
             pose = _placement(values["object_pose"]) if "object_pose" in values else None
@@ -349,9 +351,5 @@ def _read_body(entries: list[dict[str, Any]]) -> MarkerBody:
 
 def _placement(entry: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
     """T_body_marker of a marker that lies flat: position [m] and angle about z [degree]."""
-    angle = np.deg2rad(float(entry.get("angle_deg", 0.0)))
-    transform = np.eye(4)
-    transform[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    position = [float(value) for value in entry.get("position", (0.0, 0.0, 0.0))]
-    transform[:3, 3] = [*position, *[0.0] * (3 - len(position))]
-    return transform
+    position = [float(value) for value in entry.get("position", ())]
+    return planar_transform(position, np.deg2rad(float(entry.get("angle_deg", 0.0))))

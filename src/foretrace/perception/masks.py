@@ -1,4 +1,4 @@
-"""Where the object is in a picture: by what changed, brightness, colour or GrabCut; by height in a depth picture."""
+"""Where the object is in an image: by what changed, brightness, colour or GrabCut; by height in a depth image."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,11 +16,13 @@ from foretrace.perception.shadows import Shadow, find_shadow
 LEAST_CHANGE = 14.0
 """A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
 EDGE_DEPTH = 4
-"""So many pixels inside what differs, a blurred edge has risen to the object's own colour."""
+"""Pixels within which a blurred edge rises to the object's own colour."""
 BORDER = 3
-"""So far from a mask's border pixels may be covered in part [pixel]."""
+"""Distance from a mask's border in which pixels may be covered in part [pixel]."""
 SMALLEST_OBJECT = 400
 """An object of fewer pixels is taken for noise."""
+DEPTH_RIM = 2 * MINIMAL_HEIGHT
+"""Height above the table from which depth shows an object [m]."""
 PLANE_SAMPLES = 20000
 """Points that a plane is fitted to; more tell no more."""
 PLANE_TRIALS = 300
@@ -31,51 +33,38 @@ LEAST_PLANE = 0.3
 """The table must hold at least this share of the points."""
 
 
-def mask_by_background(
-    picture: UInt8[np.ndarray, "rows columns 3"],
-    background: UInt8[np.ndarray, "other_rows other_columns 3"],
-    least_change: float = LEAST_CHANGE,
-) -> Bool[np.ndarray, "rows columns"]:
-    """Pixels that differ from a picture of the same place without the object: more than half `cover_by_background`.
-
-    Raises:
-        PerceptionError: The pictures differ in size or in nearly everything.
-    """
-    return cover_by_background(picture, background, least_change) > 0.5
-
-
 def cover_by_background(
-    picture: UInt8[np.ndarray, "rows columns 3"],
+    image: UInt8[np.ndarray, "rows columns 3"],
     background: UInt8[np.ndarray, "other_rows other_columns 3"],
     least_change: float = LEAST_CHANGE,
     shadows: bool = True,
 ) -> Float[np.ndarray, "rows columns"]:
-    """Which part of each pixel something covers that a picture of the same place without the object does not show.
+    """Which part of each pixel something covers that an image of the same place without the object does not show.
 
     A change of the light as a whole is taken out first: the one gain for each colour that most pixels agree on; then
     shadows, which darken the background and keep its colour and pattern.
 
     Args:
-        picture: The picture.
+        image: The image.
         background: The same place before.
         least_change: By how much a colour must differ [of 255].
         shadows: Whether there may be shadows; without any, whatever differs is an object, of the table's colour, too.
 
     Raises:
-        PerceptionError: The pictures differ in size or in nearly everything, or what differs may be object or shadow.
+        PerceptionError: The images differ in size or in nearly everything, or what differs may be object or shadow.
     """
-    if picture.shape != background.shape:
+    if image.shape != background.shape:
         raise PerceptionError(
-            f"picture of {picture.shape[1]} x {picture.shape[0]} pixels and background of {background.shape[1]} x "
+            f"image of {image.shape[1]} x {image.shape[0]} pixels and background of {background.shape[1]} x "
             f"{background.shape[0]}: take both with one camera"
         )
-    now, before = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8) for image in (picture, background))
+    now, before = (cv2.GaussianBlur(one.astype(np.float32), (0, 0), 0.8) for one in (image, background))
     gain = np.median((now + 1.0) / (before + 1.0), axis=(0, 1))
     before = gain * before
     mask = np.abs(now - before).max(axis=2) > least_change
     if mask.mean() > 0.6:
         raise PerceptionError(
-            f"{100 * mask.mean():.0f} % of the picture differ from the background: was the camera moved or the light "
+            f"{100 * mask.mean():.0f} % of the image differ from the background: was the camera moved or the light "
             "switched? take both anew"
         )
     shadow = find_shadow(now, before, mask) if shadows else None
@@ -120,15 +109,15 @@ def _coverage(
 
 
 def mask_by_threshold(
-    picture: UInt8[np.ndarray, "rows columns *channels"], dark_object: bool | None = None
+    image: UInt8[np.ndarray, "rows columns *channels"], dark_object: bool | None = None
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Pixels on the object's side of the brightness that parts the picture best (Otsu, 1979).
+    """Pixels on the object's side of the brightness that parts the image best (Otsu, 1979).
 
     Args:
-        picture: The picture.
+        image: The image.
         dark_object: Whether the object is darker than the table; by default what touches the border less is the object.
     """
-    values = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    values = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     _, bright = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     bright = bright > 0
     if dark_object is None:
@@ -137,46 +126,46 @@ def mask_by_threshold(
 
 
 def mask_by_colour(
-    picture: UInt8[np.ndarray, "rows columns 3"], point: tuple[float, float], tolerance: float = 40.0
+    image: UInt8[np.ndarray, "rows columns 3"], point: tuple[float, float], tolerance: float = 40.0
 ) -> Bool[np.ndarray, "rows columns"]:
     """Pixels of about the colour at a point (column, row), in the CIELAB space, brightness counting half.
 
     Raises:
-        PerceptionError: The point lies outside the picture.
+        PerceptionError: The point lies outside the image.
     """
-    column, row = _inside(point, picture.shape)
-    lab = cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 1.0), cv2.COLOR_BGR2LAB).astype(np.float32)
+    column, row = _inside(point, image.shape)
+    lab = cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.COLOR_BGR2LAB).astype(np.float32)
     patch = lab[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].reshape(-1, 3)
     away = (lab - np.median(patch, axis=0)) * np.array([0.5, 1.0, 1.0], dtype=np.float32)
     return np.linalg.norm(away, axis=2) < tolerance
 
 
 def mask_by_grabcut(
-    picture: UInt8[np.ndarray, "rows columns 3"], box: tuple[int, int, int, int], iterations: int = 5
+    image: UInt8[np.ndarray, "rows columns 3"], box: tuple[int, int, int, int], iterations: int = 5
 ) -> Bool[np.ndarray, "rows columns"]:
     """The object in a box by colours and edges (Rother, Kolmogorov and Blake, 2004).
 
     Args:
-        picture: The picture.
+        image: The image.
         box: Left column, upper row, width and height of a box round the whole object, some background in it.
         iterations: Rounds of learning the colours and cutting.
 
     Raises:
-        PerceptionError: The box leaves the picture or holds no object.
+        PerceptionError: The box leaves the image or holds no object.
     """
     left, top, width, height = box
-    rows, columns = picture.shape[:2]
+    rows, columns = image.shape[:2]
     if left < 0 or top < 0 or width < 8 or height < 8 or left + width > columns or top + height > rows:
         raise PerceptionError(
-            f"box {box} in a picture of {columns} x {rows} pixels: give left, top, width and height within it"
+            f"box {box} in an image of {columns} x {rows} pixels: give left, top, width and height within it"
         )
     if width * height == rows * columns:
-        raise PerceptionError(f"box {box} is the whole picture: leave some of the table beside it")
+        raise PerceptionError(f"box {box} is the whole image: leave some of the table beside it")
     labels = np.zeros((rows, columns), dtype=np.uint8)
     models = [np.zeros((1, 65)) for _ in range(2)]
     cv2.setRNGSeed(0)
     cv2.grabCut(
-        picture, labels, (left, top, width, height), models[0], models[1], iterations, cv2.GC_INIT_WITH_RECT
+        image, labels, (left, top, width, height), models[0], models[1], iterations, cv2.GC_INIT_WITH_RECT
     )
     mask = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     if not mask.any():
@@ -184,13 +173,43 @@ def mask_by_grabcut(
     return mask
 
 
-def cover_of(
-    cover: Float[np.ndarray, "rows columns"], mask: Bool[np.ndarray, "rows columns"]
+def find_by_background(
+    image: UInt8[np.ndarray, "rows columns 3"],
+    background: UInt8[np.ndarray, "other_rows other_columns 3"],
+    point: tuple[float, float] | None = None,
+    shadows: bool = True,
 ) -> Float[np.ndarray, "rows columns"]:
-    """Which part of each pixel one object covers: as was seen near the border of its mask, all of it inside."""
-    whole, near = mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8)
+    """Which part of each pixel one object covers: `cover_by_background` near the border of its mask, all of it inside.
+
+    Args:
+        image: The image.
+        background: The same place without the object.
+        point: Column and row on or near the object; by default the largest object.
+        shadows: Whether there may be shadows.
+
+    Raises:
+        PerceptionError: As `cover_by_background` and `pick_object`.
+    """
+    cover = cover_by_background(image, background, shadows=shadows)
+    whole, near = pick_object(cover > 0.5, point).astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8)
     inside, beside = cv2.erode(whole, near[1:-1, 1:-1]) > 0, cv2.dilate(whole, near) > 0
     return np.where(inside, 1.0, np.where(beside, cover, 0.0))
+
+
+def find_by_height(
+    heights: Float[np.ndarray, "rows columns"], point: tuple[float, float] | None = None
+) -> Bool[np.ndarray, "rows columns"]:
+    """One object that stands out of the table; pixels without depth take part with their neighbours.
+
+    Args:
+        heights: Heights above the table [m], as `heights_above_table` gives them.
+        point: Column and row on or near the object; by default the largest object.
+
+    Raises:
+        PerceptionError: As `pick_object`.
+    """
+    filled = cv2.medianBlur(np.where(np.isfinite(heights), heights, -1.0).astype(np.float32), 5)
+    return pick_object(filled > DEPTH_RIM, point)
 
 
 def pick_object(
@@ -239,16 +258,16 @@ def pick_object(
         ("right", found[:, -1]),
     ):
         if pixels.any():
-            raise PerceptionError(f"the object is cut off by the {side} border of the picture: show it whole")
+            raise PerceptionError(f"the object is cut off by the {side} border of the image: show it whole")
     return found
 
 
 @dataclass(frozen=True)
 class TablePlane:
-    """The table in a depth picture."""
+    """The table in a depth image."""
 
     T_table_camera: Float[np.ndarray, "4 4"]
-    """The camera over the table: z out of the table, origin below the camera, x along the picture's columns."""
+    """The camera over the table: z out of the table, origin below the camera, x along the image's columns."""
     share: float
     """Share of the points that lie on it."""
     deviation: float
@@ -256,17 +275,17 @@ class TablePlane:
 
 
 def find_table(depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, seed: int = 0) -> TablePlane:
-    """The plane that most points of a depth picture lie on (RANSAC: Fischler and Bolles, 1981), then least squares.
+    """The plane that most points of a depth image lie on (RANSAC: Fischler and Bolles, 1981), then least squares.
 
     Raises:
-        PerceptionError: The picture holds no depth, is another camera's, or shows no table.
+        PerceptionError: The image holds no depth, is another camera's, or shows no table.
     """
-    camera.check_picture(depth, "depth picture")
+    camera.check_image(depth, "depth image")
     points = camera.deproject(depth, np.eye(4))
     if len(points) < 0.05 * depth.size:
         raise PerceptionError(
-            f"the depth picture is empty: {len(points)} of {depth.size} pixels have depth; check the sensor's range "
-            "(0.3 to 3 m) and that nothing glossy fills the picture"
+            f"the depth image is empty: {len(points)} of {depth.size} pixels have depth; check the sensor's range "
+            "(0.3 to 3 m) and that nothing glossy fills the image"
         )
     rng = np.random.default_rng(seed)
     points = points[rng.choice(len(points), min(PLANE_SAMPLES, len(points)), replace=False)]
@@ -307,20 +326,12 @@ def _fit_plane(points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "3"]
 def heights_above_table(
     depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, T_table_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Height of what each pixel sees above the table [m]; NaN where nothing was seen."""
-    camera.check_picture(depth, "depth picture")
+    """Height above the table of the point in each pixel [m]; NaN without depth."""
+    camera.check_image(depth, "depth image")
     heights = np.full(depth.shape, np.nan)
     seen = np.isfinite(depth) & (depth > 0)
     heights[seen] = camera.deproject(depth, T_table_camera)[:, 2]
     return heights
-
-
-def mask_by_height(
-    heights: Float[np.ndarray, "rows columns"], minimal_height: float = 2 * MINIMAL_HEIGHT
-) -> Bool[np.ndarray, "rows columns"]:
-    """Pixels that stand out of the table; pixels without depth take part with their neighbours."""
-    filled = cv2.medianBlur(np.where(np.isfinite(heights), heights, -1.0).astype(np.float32), 5)
-    return filled > minimal_height
 
 
 def object_height(
@@ -334,7 +345,7 @@ def object_height(
     inner = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     values = heights[inner & np.isfinite(heights)]
     if len(values) == 0:
-        raise PerceptionError("no pixel of the object has depth: check that depth and colour pictures match")
+        raise PerceptionError("no pixel of the object has depth: check that depth and colour images match")
     top = values[values > 0.5 * np.median(values)]
     return float(np.median(top))
 
@@ -346,7 +357,7 @@ def _inside(point: tuple[float, float], shape: tuple[int, ...]) -> tuple[int, in
     column, row = round(point[0]), round(point[1])
     if not (0 <= column < shape[1] and 0 <= row < shape[0]):
         raise PerceptionError(
-            f"point ({point[0]:g}, {point[1]:g}) lies outside a picture of {shape[1]} x {shape[0]} pixels: give column "
+            f"point ({point[0]:g}, {point[1]:g}) lies outside an image of {shape[1]} x {shape[0]} pixels: give column "
             "and row"
         )
     return column, row

@@ -1,4 +1,4 @@
-"""Drawn onto a camera's picture: markers, the object's outline, predicted and observed paths."""
+"""Drawn onto a camera's image: markers, the object's outline, predicted and observed paths."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ TUBE = 0.3
 
 
 def draw_overlay(
-    picture: UInt8[np.ndarray, "rows columns 3"],
+    image: UInt8[np.ndarray, "rows columns 3"],
     camera: PinholeCamera,
     T_frame_camera: Float[np.ndarray, "4 4"],
     outline: Float[np.ndarray, "n 3"] | None = None,
@@ -29,10 +29,10 @@ def draw_overlay(
     markers: Float[np.ndarray, "k 4 2"] | None = None,
     radii: Mapping[str, Float[np.ndarray, " time"]] | None = None,
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """A copy of a picture with what is known of the scene drawn into it.
+    """A copy of an image with what is known of the scene drawn into it.
 
     Args:
-        picture: The picture.
+        image: The image.
         camera: The camera that took it.
         T_frame_camera: Its pose in the frame of outline and paths.
         outline: Closed line round the object [m].
@@ -40,7 +40,7 @@ def draw_overlay(
         markers: Corners of markers [pixel].
         radii: For some of the paths, how far off each position may be [m]: drawn as a translucent tube.
     """
-    drawn = picture.copy()
+    drawn = image.copy()
     T_camera_frame = invert_transform(T_frame_camera)
     width = max(1, round(camera.width / 640))
     for corners in np.zeros((0, 4, 2)) if markers is None else markers:
@@ -76,15 +76,15 @@ def draw_overlay(
 
 
 def _line(
-    picture: np.ndarray, pixels: np.ndarray, colour: tuple[int, int, int], width: int, closed: bool
+    image: np.ndarray, pixels: np.ndarray, colour: tuple[int, int, int], width: int, closed: bool
 ) -> None:
     there = pixels[np.isfinite(pixels).all(axis=1)]
     points = np.rint(there * 2**SHIFT).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(picture, [points], closed, colour, width, cv2.LINE_AA, SHIFT)
+    cv2.polylines(image, [points], closed, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def _tube(
-    picture: np.ndarray,
+    image: np.ndarray,
     camera: PinholeCamera,
     path: Float[np.ndarray, "time 3"],
     radius: Float[np.ndarray, " time"],
@@ -96,21 +96,21 @@ def _tube(
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     circle = np.column_stack([np.cos(around), np.sin(around)])
     discs = centres[:, None] + sizes[:, None, None] * circle  # (time, 24, 2)
-    covered = np.zeros(picture.shape[:2], dtype=np.uint8)
+    covered = np.zeros(image.shape[:2], dtype=np.uint8)
     for pair in zip(discs, [*discs[1:], *discs[-1:]], strict=True):
         hull = cv2.convexHull(np.concatenate(pair).astype(np.float32))
         cv2.fillConvexPoly(covered, np.rint(hull * 2**SHIFT).astype(np.int32), 255, cv2.LINE_8, SHIFT)
     inside = covered > 0
-    picture[inside] = np.rint((1 - TUBE) * picture[inside] + TUBE * np.array(colour)).astype(np.uint8)
+    image[inside] = np.rint((1 - TUBE) * image[inside] + TUBE * np.array(colour)).astype(np.uint8)
 
 
-def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "rows columns 3"]], rate: float) -> int:
-    """Writes pictures (blue, green, red) of one size as an MP4; returns how many.
+def write_video(path: Path, images: Iterable[UInt8[np.ndarray, "rows columns 3"]], rate: float) -> int:
+    """Writes images (blue, green, red) of one size as an MP4; returns how many.
 
     Args:
         path: The file.
-        pictures: The pictures, in order.
-        rate: Pictures per second.
+        images: The images, in order.
+        rate: Images per second.
 
     Raises:
         PerceptionError: The library that writes videos is not installed, or the file cannot be written.
@@ -122,15 +122,15 @@ def write_video(path: Path, pictures: Iterable[UInt8[np.ndarray, "rows columns 3
     writer: Any = None
     count = 0
     try:
-        for picture in pictures:
+        for image in images:
             if writer is None:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                size: Any = (picture.shape[1], picture.shape[0])
+                size: Any = (image.shape[1], image.shape[0])
                 fps: Any = rate  # whole numbers are asked for, fractions taken
                 writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, macro_block_size=2)
                 writer.send(None)
             try:
-                writer.send(np.ascontiguousarray(picture[..., ::-1]))
+                writer.send(np.ascontiguousarray(image[..., ::-1]))
             except OSError as error:  # with all that ffmpeg had to say
                 raise PerceptionError(
                     f"cannot write {path}: check the folder, its permissions and the free space"

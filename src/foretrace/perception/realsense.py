@@ -1,6 +1,6 @@
 """RealSense cameras and their recordings, through the maker's library (``pip install foretrace[realsense]``).
 
-Depth is aligned with the colour pictures by that library, which knows where the two sensors sit. It was tried on
+Depth is aligned with the colour images by that library, which has the poses of the two sensors. Tested on
 recordings of a virtual camera only.
 """
 
@@ -12,37 +12,36 @@ from typing import Any
 import numpy as np
 
 from foretrace.errors import PerceptionError
-from foretrace.interactions.film_folder import Frame
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.recording_folder import Frame
+from foretrace.perception.bags import TOGETHER
 
-TOGETHER = 0.02
-"""Depth belongs to a colour picture taken at most so much earlier or later [s]."""
 LOOK = 1 << 22
-"""Bytes at either end of a bag in which the names of its topics are looked for."""
+"""Bytes at either end of a bag that are searched for the names of its topics."""
 SILENCE = 5000
-"""So long a camera or a recording may give no picture [ms]."""
+"""Longest time without an image [ms]."""
 GLANCE = 200
-"""So long a recording is waited for before it is asked whether it has ended [ms]."""
+"""Time between two checks whether a recording has ended [ms]."""
 WARM_UP = 30
 """Frames after the start that are thrown away: a camera needs them to find its exposure."""
 
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How a camera films.
+    """How a camera records.
 
     Raises:
         PerceptionError: A value is not positive.
     """
 
     width: int = 1280
-    """Columns of the pictures."""
+    """Columns of the images."""
     height: int = 720
-    """Rows of the pictures."""
+    """Rows of the images."""
     frames_per_second: int = 30
     """Frames per second."""
     depth_every: int = 10
-    """Depth is kept with every so many colour pictures; 0: never."""
+    """Colour images from one with depth to the next; 0: no depth."""
     serial: str | None = None
     """Serial number of the camera; None: the only one."""
 
@@ -61,7 +60,7 @@ def is_recording(path: Path) -> bool:
     return b"/device_0/" in ends
 
 
-def open_recording(path: Path) -> tuple[Callable[[], Iterator[Frame]], PinholeCamera | None]:
+def open_realsense(path: Path) -> tuple[Callable[[], Iterator[Frame]], PinholeCamera | None]:
     """Frames of a RealSense recording, and its colour camera as the maker calibrated it.
 
     Args:
@@ -136,12 +135,12 @@ class _Playing:
                 return
             silence += 0 if there else GLANCE
         raise PerceptionError(
-            f"RealSense recording {self._path} gives no more pictures before its end: record or copy it again"
+            f"RealSense recording {self._path} gives no more images before its end: record or copy it again"
         )
 
 
 def _once_each(framesets: Iterator[Any]) -> Iterator[Any]:
-    """One set for each colour picture: the library repeats one picture beside the next of the other kind."""
+    """One set for each colour image: the library repeats one image beside the next of the other kind."""
     held: Any = None
     for frames in framesets:
         colour = frames.get_color_frame()
@@ -171,10 +170,10 @@ def _frame(frames: Any, align: Any) -> Frame:
         depth = frames.get_depth_frame()
         metres = np.array(depth.get_data()).astype(float) * depth.get_units()
     colour = frames.get_color_frame()
-    picture, kind = np.array(colour.get_data()), colour.get_profile().format().name
+    image, kind = np.array(colour.get_data()), colour.get_profile().format().name
     if kind not in ("rgb8", "bgr8"):
         raise PerceptionError(f"RealSense recording has colour as {kind}: record it as rgb8 or bgr8")
-    ordered = picture if kind == "bgr8" else np.ascontiguousarray(picture[..., ::-1])
+    ordered = image if kind == "bgr8" else np.ascontiguousarray(image[..., ::-1])
     return Frame(colour.get_timestamp() / 1000, ordered, metres)
 
 
@@ -182,7 +181,7 @@ def _camera(rs: Any, profile: Any, name: str) -> PinholeCamera | None:
     """The colour camera as its maker calibrated it; None where its lens is described in another way than OpenCV's."""
     colours = [one for one in profile.get_streams() if one.stream_type() == rs.stream.color]
     if not colours:
-        raise PerceptionError(f"{name} has no colour stream: film with colour and depth")
+        raise PerceptionError(f"{name} has no colour stream: record with colour and depth")
     found = colours[0].as_video_stream_profile().get_intrinsics()
     bent = any(found.coeffs)
     if bent and found.model != rs.distortion.brown_conrady:
@@ -192,13 +191,13 @@ def _camera(rs: Any, profile: Any, name: str) -> PinholeCamera | None:
 
 
 class LiveCamera:
-    """A RealSense camera that films within a ``with`` block.
+    """A RealSense camera that records within a ``with`` block.
 
     Args:
-        config: How it films.
+        config: How it records.
 
     Raises:
-        PerceptionError: There is no such camera, it cannot film so, or the library is not installed.
+        PerceptionError: There is no such camera, it cannot record so, or the library is not installed.
     """
 
     def __init__(self, config: CaptureConfig = CaptureConfig()):
@@ -225,9 +224,9 @@ class LiveCamera:
         except RuntimeError as error:
             which = "" if self._config.serial is None else f" {self._config.serial}"
             raise PerceptionError(
-                f"no RealSense camera{which} films {size[0]} x {size[1]} pixels {self._config.frames_per_second} times "
-                f"a second ({error}): close other programs that use it, check its serial number and the USB 3 port, or "
-                "choose another size"
+                f"no RealSense camera{which} records {size[0]} x {size[1]} pixels {self._config.frames_per_second} "
+                f"times a second ({error}): close other programs that use it, check its serial number and the USB 3 "
+                "port, or choose another size"
             ) from error
         self.camera = _camera(rs, profile, "the RealSense camera")
         """Its colour camera, as its maker calibrated it; None where its lens is described otherwise."""
@@ -240,7 +239,7 @@ class LiveCamera:
         """Frames as they come.
 
         Args:
-            until: Asked with the time since the first frame [s]; says when to stop.
+            until: Whether to stop, from the time since the first frame [s].
 
         Raises:
             PerceptionError: The camera falls silent.
@@ -264,5 +263,5 @@ class LiveCamera:
             return self._pipeline.wait_for_frames(SILENCE)
         except RuntimeError as error:
             raise PerceptionError(
-                f"the RealSense camera gives no pictures ({error}): plug it in again"
+                f"the RealSense camera gives no images ({error}): plug it in again"
             ) from error

@@ -1,4 +1,4 @@
-"""Shadows on the background: what an object takes of the light, told from the object itself.
+"""Shadows on the background: what an object takes of the light, separated from the object.
 
 A shadow darkens what is there and leaves its colour (Horprasert, Harwood and Davis, 1999; Cucchiara et al., 2003) and
 its pattern (Jacques, Jung and Musse, 2005). What is darker, of the background's colour, and without its pattern or in a
@@ -19,7 +19,7 @@ LEAST_LIGHT = 0.3
 COLOUR_CHANGE = 0.08
 """A shadow's colour may differ by this part of the brightest channel: its light is bluer or redder than the lamp's."""
 NOISE = 3.0
-"""So much of any difference may be noise [of 255]."""
+"""Difference that may be noise [of 255]."""
 PATTERN = 1.5
 """Standard deviation of a pattern that is clear enough to be looked for [of 255]."""
 PATTERN_WINDOWS = (15, 31, 61)
@@ -27,7 +27,7 @@ PATTERN_WINDOWS = (15, 31, 61)
 PATTERN_LEFT = 0.5
 """A shadow keeps at least this part of the contrast that its darkness lets expect."""
 BORDER = 4
-"""So near to an object its colour spreads into the background's, by blur and compression [pixel]."""
+"""Distance from an object in which its colour spreads into the background, by blur and compression [pixel]."""
 SMALLEST_SHADOW = 50
 """Smaller patches of shadow are taken for noise [pixel]."""
 SMALLEST_PATCH = 400
@@ -39,7 +39,7 @@ MOST_LACKING = 0.9
 MOST_ALIKE = 0.5
 """Of what has more of the background's colour than this, a part may be taken for shadow: its sides are darker."""
 ENCLOSING_GAP = 15
-"""A shadow encloses what it surrounds but for gaps as wide as this [pixel]: that is rather a picture on an object."""
+"""A shadow encloses what it surrounds but for gaps as wide as this [pixel]: that is rather a pattern on an object."""
 DOUBTFUL = (
     "shadow and object cannot be told apart: what differs from the background has its colour, and may be a shadow or "
     "an object of that colour; find the object by depth, lay a sheet of another colour on the table, or light it from "
@@ -49,7 +49,7 @@ DOUBTFUL = (
 
 @dataclass(frozen=True)
 class Shadow:
-    """What a picture shows of shadows."""
+    """What an image shows of shadows."""
 
     pixels: Bool[np.ndarray, "rows columns"]
     """Where shadow is seen, and nothing but the background in it."""
@@ -65,8 +65,8 @@ def find_shadow(
     """Shadows on the background, if there are any.
 
     Args:
-        now: The picture.
-        before: The background under the light of the picture as a whole.
+        now: The image.
+        before: The background under the light of the image as a whole.
         changed: Where they differ.
 
     Raises:

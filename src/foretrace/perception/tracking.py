@@ -1,9 +1,9 @@
-"""The path of a body with markers through a film: one pose per frame, smooth, without delay, with its uncertainty.
+"""The path of a body with markers through a recording: one pose per frame, smooth, without delay, with its uncertainty.
 
-Every frame gives up to two poses that explain it. Which one is meant is decided for the whole film at once, by the
+Every frame gives up to two poses that explain it. Which one is meant is decided for the whole recording at once, by the
 least reprojection error and the least turning from frame to frame (Viterbi, 1967). From there all frames are fitted
 together: the corners where they were seen, the motion with as little acceleration as they allow, outliers and
-impacts forgiven (Huber, 1964). What a fit of the whole film says of a frame lags behind nothing.
+impacts forgiven (Huber, 1964). The fit of the whole recording has no delay.
 """
 
 from collections.abc import Sequence
@@ -21,13 +21,14 @@ from foretrace.errors import PerceptionError
 from foretrace.geometry import rotation_angle
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.perception.markers import Detections, MarkerBody, PoseCandidate
+from foretrace.trajectories import interpolate_poses
 
 Matches = tuple[np.ndarray, np.ndarray]
 """Points of the body and where they were seen."""
 NOTHING: Matches = (np.zeros((0, 3)), np.zeros((0, 2)))
 ITERATIONS = 12
 HUBER = 1.5
-"""Residuals up to so many standard deviations count in full."""
+"""Largest residual that counts in full [standard deviations]."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,13 @@ class TrackConfig:
     largest_error: float = 3.0
     """A frame whose best pose misses the corners by more counts as not seen [pixel]."""
     turning: float = 6.0
-    """Turning that is taken for normal when two poses are told apart [rad/s]."""
+    """Nominal speed of turning, by which the right one of two poses is chosen [rad/s]."""
     acceleration: float = 0.3
-    """Acceleration that is taken for normal [m/s^2]; impacts are outliers."""
+    """Nominal acceleration [m/s^2]; impacts are outliers."""
     angular_acceleration: float = 3.0
     """The same for rotations [rad/s^2]."""
     least_noise: float = 0.05
-    """Corners are not taken for more certain than this [pixel]."""
+    """Least standard deviation of a corner [pixel]."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -72,7 +73,7 @@ class Track:
     covariance: Float[np.ndarray, "frame 6 6"]
     """Covariance of rotation and position: a small turn about the camera's axes [rad], then metres."""
     noise: float
-    """How precisely the corners were seen, in the film's own judgement [pixel]."""
+    """Standard deviation of the corners, estimated from the recording [pixel]."""
 
     def gaps(self) -> list[tuple[float, float]]:
         """Beginning and end of each stretch without a pose [s]."""
@@ -127,7 +128,7 @@ def track(
     )
     for piece in pieces:
         inside = np.arange(int(indices[piece[0]]), int(indices[piece[-1]]) + 1)
-        start = _bridge(times[inside], times[indices[piece]], chosen[piece])
+        start = interpolate_poses(times[indices[piece]], chosen[piece], times[inside])
         poses[inside], covariance[inside] = _smooth(
             times[inside], start, [matches[k] for k in inside], camera, deviations[inside], config
         )
@@ -141,19 +142,24 @@ def track(
     return Track(times, poses, seen & ~strange, errors, covariance, float(np.median(noise)))
 
 
-def check_times(times: Float[np.ndarray, " frame"]) -> None:
+def check_times(times: Float[np.ndarray, " frame"], of: str = "") -> None:
     """Refuse time stamps that do not increase.
+
+    Args:
+        times: Time stamps [s].
+        of: What they belong to, for the message.
+
 
     Raises:
         PerceptionError: Naming the first frame that is not later than the one before.
     """
     if not np.isfinite(times).all():
-        raise PerceptionError(f"frame {int((~np.isfinite(times)).argmax())} has no time stamp")
+        raise PerceptionError(f"frame {int((~np.isfinite(times)).argmax())}{of} has no time stamp")
     if (np.diff(times) <= 0).any():
         k = int((np.diff(times) <= 0).argmax())
         raise PerceptionError(
-            f"time stamps do not increase: frame {k + 1} at {times[k + 1]:.6f} s follows {times[k]:.6f} s; "
-            "sort or film again"
+            f"time stamps{of} do not increase: frame {k + 1} at {times[k + 1]:.6f} s follows {times[k]:.6f} s; "
+            "sort or record again"
         )
 
 
@@ -187,34 +193,6 @@ def _corner_noise(
     corners = np.asarray(counts)
     freed = np.asarray(errors) * np.sqrt(corners / np.maximum(2 * corners - 6, 1))
     return np.maximum(freed, max(config.least_noise, float(np.median(freed))))
-
-
-def _bridge(
-    times: Float[np.ndarray, " frame"],
-    known_times: Float[np.ndarray, " known"],
-    known: Float[np.ndarray, "known 4 4"],
-) -> Float[np.ndarray, "frame 4 4"]:
-    """Poses at all times, those between known ones interpolated."""
-    if len(known) == 1:
-        return np.repeat(known, len(times), axis=0)
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, :3, 3] = np.column_stack([np.interp(times, known_times, known[:, i, 3]) for i in range(3)])
-    poses[:, :3, :3] = slerp(known_times, known[:, :3, :3], times)
-    return poses
-
-
-def slerp(
-    known_times: Float[np.ndarray, " known"],
-    rotations: Float[np.ndarray, "known 3 3"],
-    times: Float[np.ndarray, " time"],
-) -> Float[np.ndarray, "time 3 3"]:
-    """Rotations at some times between known ones; before the first and after the last they stay."""
-    after = np.clip(np.searchsorted(known_times, times), 1, len(known_times) - 1)
-    span = known_times[after] - known_times[after - 1]
-    share = np.clip((times - known_times[after - 1]) / span, 0.0, 1.0)
-    first = Rotation.from_matrix(rotations[after - 1])
-    step = (first.inv() * Rotation.from_matrix(rotations[after])).as_rotvec()
-    return np.asarray((first * Rotation.from_rotvec(share[:, None] * step)).as_matrix())
 
 
 def _smooth(

@@ -1,9 +1,9 @@
-"""From an object's mask in a picture to its outline on the table, the lever-up and the view from above.
+"""From an object's mask in an image to its outline on the table, the lever-up and the view from above.
 
 A slanted camera sees the upper face shifted away from it, and the sides that face it. Both are undone for prisms: the
 mask is laid onto the plane of the upper face and onto the plane of the lower rim, and the object is where both agree.
 That is exact for convex outlines. What is assumed: vertical sides, the height that is given, and a lower rim at the
-height of the usual bevel.
+height of the nominal bevel.
 """
 
 from dataclasses import dataclass
@@ -12,20 +12,22 @@ import cv2
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
+from scipy.optimize import least_squares
 
 from foretrace.actions import LeverUp
 from foretrace.errors import PerceptionError, ShapeError
-from foretrace.geometry import convex_hull, invert_transform, transform_points
+from foretrace.geometry import convex_hull, invert_transform, planar_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.interactions.topdown import MINIMAL_HEIGHT, TopDownView
-from foretrace.objects import BEVEL, ObjectModel, Prism, silhouette_origin
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import BEVEL, ObjectModel, Prism, read_silhouette, silhouette_origin
+from foretrace.perception.masks import DEPTH_RIM
 
 GRID = 0.00025
 """Side of a pixel of the rectified mask [m]."""
 TOLERANCE = 0.002
-"""How far the polygon may leave the outline [m]: less would follow the noise of its edge, and so would directions."""
+"""Largest distance of the polygon from the outline [m]: less follows the noise of the edge."""
 BLUNTED = 3.0
-"""How much of a right-angled corner a lens may take [pixel]."""
+"""Length that a lens may take from a right-angled corner [pixel]."""
 SMOOTHING = 1.0
 """Standard deviation by which the steps of a mask's border are smoothed [pixel]."""
 LARGEST_OBJECT = 1.0
@@ -50,8 +52,8 @@ class PlacedObject:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What a predictor needs to know of a picture."""
+class Observation:
+    """Object, lever-up and view in an image."""
 
     placed: PlacedObject
     """The object on the table."""
@@ -83,7 +85,7 @@ def place_object(
     """The prism that a mask shows, on the table.
 
     Args:
-        mask: The object in the picture, as the camera sees it; or, which is finer, how much of each pixel it covers.
+        mask: The object in the image, as the camera sees it; or, which is finer, how much of each pixel it covers.
         camera: The camera.
         T_table_camera: Its pose.
         height: Height of the object's upper face [m].
@@ -93,7 +95,7 @@ def place_object(
     Raises:
         PerceptionError: The mask is empty, of another camera, or leads to no believable object.
     """
-    camera.check_picture(mask, "mask")
+    camera.check_image(mask, "mask")
     if not mask.any():
         raise PerceptionError("the mask is empty: no object to place")
     if not 0 <= rim < height < T_table_camera[2, 3]:
@@ -119,10 +121,9 @@ def place_object(
             prism = Prism(convex_hull(prism.corners), height, prism.bevel)
     except ShapeError as error:
         raise PerceptionError(f"the mask shows no usable object: {error}") from error
-    origin = silhouette_origin(_largest(flat))
-    T = np.eye(4)
-    T[:2, 3] = low + GRID * np.array([origin[1] + 0.5, size[1] - 1 - origin[0] + 0.5])
-    return PlacedObject(prism, T)
+    origin = silhouette_origin(read_silhouette(flat))  # of the largest patch, without holes
+    shift = low + GRID * np.array([origin[1] + 0.5, size[1] - 1 - origin[0] + 0.5])
+    return PlacedObject(prism, planar_transform(shift, 0.0))
 
 
 def pixel_size(
@@ -140,7 +141,7 @@ def convex_hull_indices(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _lay_out(
-    mask: Float[np.ndarray, "picture_rows picture_columns"],
+    mask: Float[np.ndarray, "image_rows image_columns"],
     camera: PinholeCamera,
     T_table_camera: np.ndarray,
     low: np.ndarray,
@@ -149,19 +150,19 @@ def _lay_out(
 ) -> Bool[np.ndarray, "rows columns"]:
     """A mask laid onto the plane at a height: x to the right, y up, pixels of `GRID`."""
     width, length = (int(n) for n in size)
-    x = low[0] + GRID * (np.arange(width) + 0.5)
-    y = low[1] + GRID * (np.arange(length)[::-1] + 0.5)
-    points = np.stack([*np.meshgrid(x, y), np.full((length, width), height)], axis=-1).reshape(-1, 3)
-    pixels = camera.project(points, invert_transform(T_table_camera)).astype(np.float32)
-    columns, rows = pixels.T.reshape(2, length, width)
+    T_camera_table = invert_transform(T_table_camera)
+    # From (column, row, 1) of the grid to points in the table frame, then in the camera frame.
+    grid = [
+        [GRID, 0.0, low[0] + 0.5 * GRID],
+        [0.0, -GRID, low[1] + GRID * (length - 0.5)],
+        [0.0, 0.0, height],
+    ]
+    rays = T_camera_table[:3, :3] @ np.array(grid)
+    rays[:, 2] += T_camera_table[:3, 3]
+    columns, rows = cv2.initUndistortRectifyMap(
+        camera.matrix, camera.coefficients, np.eye(3), np.linalg.inv(rays), (width, length), cv2.CV_32FC1
+    )
     return cv2.remap(mask, columns, rows, cv2.INTER_LINEAR) >= 0.5
-
-
-def _largest(flat: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
-    """The largest patch of a mask, without holes: what `Prism.from_mask` sees."""
-    from foretrace.objects import read_silhouette
-
-    return read_silhouette(flat)
 
 
 def fit_object(mask_object: PlacedObject, obj: ObjectModel) -> PlacedObject:
@@ -191,12 +192,9 @@ def fit_object(mask_object: PlacedObject, obj: ObjectModel) -> PlacedObject:
     if twins:
         raise PerceptionError(
             f"the object fits its outline in several ways (turned by {np.rad2deg(abs(twins[0][1][2] - pose[2])):.0f} "
-            "degrees as well): say where the marker sits on it with object_pose in the marker layout"
+            "degrees as well): give object_pose, the marker's place on it, in the marker layout"
         )
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]]
-    T[:2, 3] = pose[:2]
-    return PlacedObject(obj, T)
+    return PlacedObject(obj, planar_transform(pose[:2], float(pose[2])))
 
 
 def _moved(corners: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -218,8 +216,6 @@ def _start(seen: shapely.Polygon, known: shapely.Polygon, angle: float) -> np.nd
 
 def _refine(seen: shapely.Polygon, corners: np.ndarray, start: np.ndarray) -> np.ndarray:
     """x, y and angle near a start for which points of one outline lie on the other, by least squares."""
-    from scipy.optimize import least_squares
-
     ring = shapely.LinearRing(corners)
     along = np.linspace(0, 1, 80, endpoint=False)
     points = shapely.get_coordinates(shapely.line_interpolate_point(seen.exterior, along, normalized=True))
@@ -238,7 +234,7 @@ def contact_at_pixel(
     camera: PinholeCamera,
     T_table_camera: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "2"]:
-    """The point of a picture as a point in the object frame [m]: it is taken to lie on the upper face's rim.
+    """The point of an image as a point in the object frame [m]: it is taken to lie on the upper face's rim.
 
     Raises:
         PerceptionError: The line of sight does not meet that plane.
@@ -250,7 +246,7 @@ def contact_at_pixel(
     return transform_points(invert_transform(placed.T_table_object), in_table[None])[0, :2]
 
 
-def see(placed: PlacedObject, contact: Float[np.ndarray, "2"]) -> Sight:
+def observe(placed: PlacedObject, contact: Float[np.ndarray, "2"]) -> Observation:
     """The lever-up at the outline's point nearest to a contact, and the exact view of it.
 
     Args:
@@ -268,7 +264,7 @@ def see(placed: PlacedObject, contact: Float[np.ndarray, "2"]) -> Sight:
             f"contact ({x:.3f}, {y:.3f}) m lies {gap:.3f} m from the object's outline: choose a point within "
             f"{LARGEST_SNAP} m of it"
         )
-    return Sight(placed, action, TopDownView.of(placed.object, action))
+    return Observation(placed, action, TopDownView.of(placed.object, action))
 
 
 def view_of_depth(
@@ -276,14 +272,14 @@ def view_of_depth(
     mask: Bool[np.ndarray, "rows columns"],
     camera: PinholeCamera,
     T_action_camera: Float[np.ndarray, "4 4"],
-    minimal_height: float = 2 * MINIMAL_HEIGHT,
+    minimal_height: float = DEPTH_RIM,
 ) -> TopDownView:
     """The depth-enriched view (paper, section 5.5): what the mask's pixels see, of any shape, in the action frame.
 
     Raises:
-        PerceptionError: The pictures do not match the camera.
+        PerceptionError: The images do not match the camera.
         ViewError: No point of the object lies in the window.
     """
-    camera.check_picture(depth, "depth picture")
+    camera.check_image(depth, "depth image")
     points = camera.deproject(np.where(mask, depth, 0.0), T_action_camera)
     return TopDownView.from_points(points, minimal_height)

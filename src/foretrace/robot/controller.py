@@ -1,7 +1,7 @@
 """The controller of a UR arm (CB3), through ur_rtde (`foretrace[ur]`).
 
 What ur_rtde does on its own decides how it is used here. When the connection breaks it connects again by itself, and
-with its usual flags uploads its program again: so the program is uploaded once, by hand, and never comes back after a
+with its default flags uploads its program again: so the program is uploaded once, by hand, and never comes back after a
 stop. It reports commands as sent on a connection that is gone: so the age of the arm's data decides, not its return
 values. It cannot be interrupted while it connects, and its destructors may wait forever: so ports are tried first, and
 its objects are never destroyed.
@@ -75,7 +75,7 @@ ROBOT_MODES = {
 
 @dataclass(frozen=True)
 class ArmState:
-    """What the controller last said."""
+    """State of the arm that the controller last sent."""
 
     timestamp: float
     """Time since the controller was started [s]."""
@@ -129,7 +129,7 @@ class UrController:
         self._heard, self._timestamp = time.monotonic(), -np.inf
 
     def state(self) -> ArmState:
-        """What the controller last said."""
+        """State that the controller last sent."""
         receive = self._receive
         return ArmState(
             timestamp=receive.getTimestamp(),
@@ -144,7 +144,7 @@ class UrController:
         )
 
     def silence(self, state: ArmState) -> float:
-        """How long the controller has said nothing new up to a state just read [s]; infinite if it hung up."""
+        """Time without anything new from the controller up to a state just read [s]; infinite if it hung up."""
         now = time.monotonic()
         if state.timestamp != self._timestamp:
             self._heard, self._timestamp = now, state.timestamp

@@ -15,17 +15,17 @@ from jaxtyping import Float
 from foretrace.errors import RobotError
 from foretrace.robot.checks import ArmLimits, Check, check_path, check_start, refuse_unsafe
 from foretrace.robot.controller import ArmState, UrController
-from foretrace.robot.filming import Filming
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import LEVER_UP, ArmPath, plan_approach
+from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
 
 LAG = 0.3
-"""The arm is compared with the set points of so long [s]: it follows them with a delay."""
+"""Time over which set points are compared with the arm, which follows them with a delay [s]."""
 SETTLE = 0.3
 """How long the last set point is held [s]."""
 STILL = 0.005
-"""Largest turn of a joint while somebody decides whether the arm may move [rad]."""
+"""Largest turn of a joint between check and motion [rad]."""
 FULL_SPEED = 0.99
 """Least speed scaling of the controller; below, the arm would fall behind its set points."""
 
@@ -49,7 +49,7 @@ class WatchConfig:
                 raise RobotError(f"{name} = {getattr(self, name)} is outside {low:g} to {high:g}")
 
 
-class Recording:
+class MotionLog:
     """A CSV file of the motion, written as it happens.
 
     Raises:
@@ -77,7 +77,7 @@ class Recording:
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow(self.COLUMNS)
 
-    def __enter__(self) -> "Recording":
+    def __enter__(self) -> "MotionLog":
         return self
 
     def __exit__(
@@ -101,7 +101,7 @@ def execute(
     limits: ArmLimits,
     watch: WatchConfig,
     confirm: Callable[[list[Check]], bool],
-    film: Filming | None = None,
+    video: VideoRecorder | None = None,
 ) -> None:
     """Bring the arm to the start of the first leg, and move it along all of them.
 
@@ -115,8 +115,8 @@ def execute(
         out: CSV file to record to; must not be there.
         limits: Limits of the way to the start.
         watch: When to give up.
-        confirm: Told the checks of the way to the start; only if it says yes does the arm move.
-        film: A camera to film the motion with.
+        confirm: Whether the arm may move, from the checks of its way to the start.
+        video: Recorder that films the motion.
 
     Raises:
         RobotError: If the arm is not ready, its way to the start is not safe, or the motion was stopped.
@@ -135,8 +135,8 @@ def execute(
         refuse_unready(controller.state(), host)
         if np.abs(controller.state().joints - state.joints).max() > STILL:
             raise RobotError("the arm was moved since its way to the start was checked: start again")
-        with Recording(out) as recording, film or nullcontext():
-            _move(controller, [approach, *legs], recording, watch, film)
+        with MotionLog(out) as log, video or nullcontext():
+            _move(controller, [approach, *legs], log, watch, video)
     finally:
         controller.close()
 
@@ -161,9 +161,9 @@ def refuse_unready(state: ArmState, host: str) -> None:
 def _move(
     controller: UrController,
     legs: Sequence[ArmPath],
-    recording: Recording,
+    log: MotionLog,
     watch: WatchConfig,
-    film: Filming | None,
+    video: VideoRecorder | None,
 ) -> None:
     """Give one set point each control period; none is ever left out, so a delay here only makes the arm wait."""
     recent: deque[np.ndarray] = deque(maxlen=round(LAG / CONTROL_PERIOD))
@@ -173,11 +173,11 @@ def _move(
     try:
         controller.take_control()
         for leg in [*legs, hold]:
-            if film is not None and leg.name == LEVER_UP:
-                film.action_start = time.monotonic()
+            if video is not None and leg.name == LEVER_UP:
+                video.action_start = time.monotonic()
             for sample, set_point in enumerate(leg.joints):
                 state = controller.state()
-                recording.add(leg.name, state, recent[-1])
+                log.add(leg.name, state, recent[-1])
                 reason = _reason_to_stop(controller, state, recent, watch)
                 if not reason and not controller.send(set_point):
                     reason = "connection lost"

@@ -1,6 +1,5 @@
 """The arm's joint path for one lever-up on a real table, in legs that each start and end at rest."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import RobotError
+from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, pose_to_matrix
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.simulation import arm
@@ -50,15 +50,8 @@ def read_base_pose(file: Path) -> Float[np.ndarray, "4 4"]:
     Raises:
         RobotError: If the file cannot be read, or is not such a pose.
     """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RobotError(f"cannot read a base pose from {file} ({error}): give a JSON file") from error
-    found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
-    if found != (FILE_FORMAT, FILE_VERSION):
-        raise RobotError(
-            f"{file} has format {found[0]!r}, version {found[1]!r}: expected {FILE_FORMAT!r}, {FILE_VERSION}"
-        )
+    remedy = "give a JSON file with T_table_base"
+    content = read_versioned(file, FILE_FORMAT, FILE_VERSION, RobotError, remedy, key="version")
     try:
         pose = np.array(content.get("T_table_base"), dtype=float)
     except (TypeError, ValueError):
@@ -141,7 +134,7 @@ def _knots(duration: float) -> Float[np.ndarray, " time"]:
 
 
 def _minimum_jerk(num: int) -> Float[np.ndarray, " {num}"]:
-    """From 0 to 1 in so many samples, at rest at both ends."""
+    """Progress from 0 to 1, at rest at both ends."""
     s = np.linspace(0, 1, num)
     return s**3 * (10 - 15 * s + 6 * s**2)
 

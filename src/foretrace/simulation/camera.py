@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from mujoco.rendering.classic import gl_context
 
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
-from foretrace.geometry import matrix_to_pose
+from foretrace.geometry import matrix_to_pose, planar_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Physics
 from foretrace.interactions.topdown import TopDownView
@@ -30,7 +30,7 @@ MINIMAL_HEIGHT = 0.008
 
 @dataclass(frozen=True)
 class RgbdFrame:
-    """One picture of an RGB-D camera."""
+    """One image of an RGB-D camera."""
 
     rgb: UInt8[np.ndarray, "rows columns 3"]
     """Colour."""
@@ -42,7 +42,7 @@ class RgbdFrame:
     """Pose of the camera in the action frame (camera frame: x right, y down, z forward)."""
 
     def view(self) -> TopDownView:
-        """The picture seen from above: what every real depth image goes through, too."""
+        """The image seen from above: what every real depth image goes through, too."""
         points = self.camera.deproject(self.depth, self.T_action_camera)
         return TopDownView.from_points(points, MINIMAL_HEIGHT)
 
@@ -62,7 +62,7 @@ class RgbdConfig:
 def take_rgbd(
     obj: ObjectModel, action: LeverUp, config: RgbdConfig = RgbdConfig(), *, seed: int = 0
 ) -> RgbdFrame:
-    """Renders the object on the table before the arm comes into the picture.
+    """Renders the object on the table before the arm comes into the image.
 
     Args:
         obj: The object.
@@ -76,26 +76,20 @@ def take_rgbd(
     camera = config.camera
     spec = build_scene(obj, Physics(), Tool(), None, timestep=0.002)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
-    # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the picture.
+    # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the image.
     spec.worldbody.add_camera(name="above", pos=config.position, quat=[np.sqrt(0.5), 0, 0, -np.sqrt(0.5)])
     model = spec.compile()
     model.cam_fovy[0] = np.rad2deg(2 * np.arctan(camera.height / 2 / camera.fy))
     data = mujoco.MjData(model)
-    T_object_body = np.eye(4)
-    T_object_body[:3, 3] = body_origin(obj)
-    data.qpos[:7] = matrix_to_pose(action.T_action_object @ T_object_body)
+    data.qpos[:7] = matrix_to_pose(action.T_action_object @ planar_transform(body_origin(obj), 0.0))
     mujoco.mj_forward(model, data)
     with make_renderer(model, camera.height, camera.width) as renderer:
-        renderer.update_scene(data, camera="above")
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-        rgb = renderer.render().copy()
-        renderer.enable_depth_rendering()
-        depth = renderer.render().astype(float)
+        rgb = render(renderer, data, "above")
+        depth = render(renderer, data, "above", depth=True).astype(float)
     sigma = config.noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     depth += np.random.default_rng(seed).normal(size=depth.shape) * sigma
     T = np.eye(4)
-    # The picture's rows run along -x and its columns along -y of the action frame, as in the top-down view.
+    # The image's rows run along -x and its columns along -y of the action frame, as in the top-down view.
     T[:3, :3] = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
     T[:3, 3] = config.position
     return RgbdFrame(rgb, depth, camera, T)
@@ -127,6 +121,30 @@ def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
         raise SimulationError(
             f"cannot open a renderer ({error}): set MUJOCO_GL to egl or osmesa, or use the exact camera"
         ) from error
+
+
+def render(
+    renderer: mujoco.Renderer, data: mujoco.MjData, camera: str, *, depth: bool = False, shadows: bool = False
+) -> Shaped[np.ndarray, "rows columns *channels"]:
+    """One image of a scene: red, green and blue, or distance along the optical axis [m].
+
+    Args:
+        renderer: The renderer.
+        data: State of the scene.
+        camera: Name of the camera.
+        depth: Render depth instead of colour.
+        shadows: Let the scene's lamps cast shadows.
+    """
+    renderer.update_scene(data, camera=camera)
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+    if not depth:
+        return renderer.render()
+    renderer.enable_depth_rendering()
+    try:
+        return renderer.render()
+    finally:
+        renderer.disable_depth_rendering()
 
 
 def _loads(library: str) -> bool:

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from foretrace.geometry import matrix_to_quaternion
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.simulation.camera import make_renderer
+from foretrace.simulation.camera import make_renderer, render
 
 WEBCAM = PinholeCamera(1280, 720, 921.0, 922.5, 648.0, 351.0, distortion=(0.09, -0.21, 0.0008, -0.0006, 0.11))
 """About what the colour camera of a depth camera has: 70 x 43 degrees, a lens of its time."""
@@ -22,14 +22,14 @@ WEBCAM = PinholeCamera(1280, 720, 921.0, 922.5, 648.0, 351.0, distortion=(0.09, 
 
 @dataclass(frozen=True)
 class Faults:
-    """What keeps a picture from being perfect."""
+    """What keeps an image from being perfect."""
 
     blur: float = 0.7
     """Standard deviation of the defocus [pixel]."""
     noise: float = 2.0
     """Standard deviation of the noise of each colour [of 255]."""
     flicker: float = 0.15
-    """Largest change of the light over a film, as a part of it; it also falls off over the picture by that."""
+    """Largest change of the light over a recording, as a part of it; it also falls off over the image by that."""
     depth_noise: float = 1.0
     """Scale of the depth noise that Nguyen et al. (2012) measured on a Kinect."""
     depth_holes: float = 0.01
@@ -68,10 +68,10 @@ class LensCamera:
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         # MuJoCo's camera has y up and looks along -z.
         turned = matrix_to_quaternion(T_world_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
-        spec.worldbody.add_camera(name="film", pos=T_world_camera[:3, 3], quat=turned)
+        spec.worldbody.add_camera(name="lens", pos=T_world_camera[:3, 3], quat=turned)
         self.camera, self.model, self._lamp = camera, spec.compile(), lamp
         """Intrinsics, and the compiled scene."""
-        self.model.cam_fovy[self.model.camera("film").id] = np.rad2deg(2 * np.arctan(height / 2 / camera.fy))
+        self.model.cam_fovy[self.model.camera("lens").id] = np.rad2deg(2 * np.arctan(height / 2 / camera.fy))
         self.data = mujoco.MjData(self.model)
         """State of the scene."""
         self._renderer = make_renderer(self.model, height, width)
@@ -84,59 +84,48 @@ class LensCamera:
 
     def colours(self) -> Float[np.ndarray, "rows columns 3"]:
         """The scene as it is: blue, green, red, bent by the lens and without noise."""
-        if self._lamp is None:
-            self._update()
-            rgb = self._renderer.render().astype(np.float32)
-        else:
-            rgb = np.mean([self._lit_from(point) for point in self._lamp], axis=0)
-        return self._bend(rgb[..., ::-1], cv2.INTER_LINEAR)
+        lit = [self._render()] if self._lamp is None else [self._lit_from(point) for point in self._lamp]
+        return self._bend(np.mean(lit, axis=0)[..., ::-1], cv2.INTER_LINEAR)
 
     def _lit_from(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows columns 3"]:
         self.model.light_pos[0] = point
-        self._update(shadows=True)
-        return self._renderer.render().astype(np.float32)
+        return self._render(shadows=True)
 
     def depths(self) -> Float[np.ndarray, "rows columns"]:
         """Distance along the optical axis [m], without noise."""
-        self._update()
-        self._renderer.enable_depth_rendering()
-        depth = self._renderer.render().astype(np.float32)
-        self._renderer.disable_depth_rendering()
-        return self._bend(depth, cv2.INTER_NEAREST).astype(float)
+        return self._bend(self._render(depth=True), cv2.INTER_NEAREST).astype(float)
 
-    def _update(self, shadows: bool = False) -> None:
+    def _render(self, **what: bool) -> np.ndarray:
         mujoco.mj_forward(self.model, self.data)
-        self._renderer.update_scene(self.data, camera="film")
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        return render(self._renderer, self.data, "lens", **what).astype(np.float32)
 
-    def _bend(self, picture: np.ndarray, interpolation: int) -> Any:
-        return cv2.remap(picture, self._maps[0], self._maps[1], interpolation)
+    def _bend(self, image: np.ndarray, interpolation: int) -> Any:
+        return cv2.remap(image, self._maps[0], self._maps[1], interpolation)
 
 
 def spoil(
-    picture: Float[np.ndarray, "rows columns 3"], faults: Faults, light: float, rng: np.random.Generator
+    image: Float[np.ndarray, "rows columns 3"], faults: Faults, light: float, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """A picture as a sensor delivers it.
+    """An image as a sensor delivers it.
 
     Args:
-        picture: The perfect picture.
+        image: The perfect image.
         faults: How imperfect it becomes.
         light: Where in its range the light is, from -1 to 1.
         rng: Draws the noise.
     """
-    slope = np.linspace(1.0, 1.0 - faults.flicker, picture.shape[1])[None, :, None]
-    lit = picture * slope * (1 + faults.flicker * light)
+    slope = np.linspace(1.0, 1.0 - faults.flicker, image.shape[1])[None, :, None]
+    lit = image * slope * (1 + faults.flicker * light)
     if faults.blur > 0:
         lit = cv2.GaussianBlur(lit, (0, 0), faults.blur)
-    noise = faults.noise * _noise(picture.shape, rng)
+    noise = faults.noise * _noise(image.shape, rng)
     return np.clip(np.rint(lit + noise), 0, 255).astype(np.uint8)
 
 
 def spoil_depth(
     depth: Float[np.ndarray, "rows columns"], faults: Faults, rng: np.random.Generator
 ) -> Float[np.ndarray, "rows columns"]:
-    """A depth picture as a sensor delivers it [m]; 0 where it saw nothing."""
+    """A depth image as a sensor delivers it [m]; 0 where it saw nothing."""
     sigma = faults.depth_noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     noisy = depth + sigma * _noise(depth.shape, rng)
     return np.where(rng.random(depth.shape, dtype=np.float32) < faults.depth_holes, 0.0, noisy)
@@ -157,29 +146,29 @@ def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     return bank[start : start + size].reshape(shape)
 
 
-def add_picture(
+def add_image(
     body: mujoco.MjsBody,
     spec: mujoco.MjSpec,
     name: str,
-    picture: UInt8[np.ndarray, "rows columns"],
+    image: UInt8[np.ndarray, "rows columns"],
     size: tuple[float, float],
     pose: Float[np.ndarray, "7"],
 ) -> None:
-    """Adds a thin slab with a picture on its upper face, which nothing touches.
+    """Adds a thin slab with an image on its upper face, which nothing touches.
 
     Args:
         body: What it lies on.
         spec: The scene.
         name: A name that is still free.
-        picture: The picture in grey.
+        image: The image in grey.
         size: Width and height [m].
-        pose: Its middle in the body's frame: x to the right in the picture, y up, z out of it.
+        pose: Its middle in the body's frame: x to the right in the image, y up, z out of it.
     """
-    rows, columns = picture.shape
+    rows, columns = image.shape
     texture = spec.add_texture(
         name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=columns, height=rows, nchannel=3
     )
-    texture.data = np.repeat(picture[..., None], 3, axis=2).tobytes()
+    texture.data = np.repeat(image[..., None], 3, axis=2).tobytes()
     material = spec.add_material(name=name)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     x, y, z = size[0] / 2, size[1] / 2, SLAB / 2

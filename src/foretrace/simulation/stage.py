@@ -1,4 +1,4 @@
-"""What surrounds the object in a film: a lamp whose shadows are soft, a table with a pattern, the object's colour."""
+"""Surroundings of a recorded object: a lamp with soft shadows, a table with a pattern, the object's colour."""
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs.

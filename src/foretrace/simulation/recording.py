@@ -1,9 +1,8 @@
-"""Films of simulated lever-ups, with markers on object and table, as a camera above a real table would take them."""
+"""Recordings of simulated lever-ups, with markers on object and table, as a camera above a table takes them."""
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs.
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,14 +16,15 @@ from jaxtyping import Float, UInt8
 
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
-from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
-from foretrace.interactions import film_folder
-from foretrace.interactions.film_folder import FilmNotes, Frame, write_film
+from foretrace.files import write_json
+from foretrace.geometry import invert_transform, matrix_to_pose, planar_transform, pose_to_matrix
+from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
+from foretrace.interactions.recording_folder import Frame, RecordingNotes, write_recording
 from foretrace.objects import ObjectModel
 from foretrace.simulation.engine import Motion
-from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_picture, spoil, spoil_depth
+from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_image, spoil, spoil_depth
 from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.stage import ObjectColour, TableTop, cast_shadows, set_stage
@@ -32,16 +32,16 @@ from foretrace.simulation.stage import ObjectColour, TableTop, cast_shadows, set
 DICTIONARY = "apriltag_36h11"
 MODULES = 8
 """Modules along a side of such a marker, its black rim included; a white margin of one goes round it."""
-PICTURE_PIXELS = 40
+IMAGE_PIXELS = 40
 """Pixels along a module of a marker's texture."""
 FINE_PERIOD = 0.01
-"""Time between the states that a film is interpolated from [s]."""
+"""Time between the states that a recording is interpolated from [s]."""
 TABLE_SPOTS = ((0.33, 0.15), (0.33, -0.15), (-0.13, 0.21), (-0.13, -0.21))
 """Where the table's markers lie in the action frame [m]: clear of any object of 10 cm radius."""
 OBJECT_ID = 10
 OUT_OF_SIGHT = (0.0, 0.0, -5.0)
 FAULTS = Faults()
-"""The usual ones."""
+"""The nominal ones."""
 RANGES = {
     "width": (64, 7680),
     "distance": (0.1, 10.0),
@@ -53,12 +53,12 @@ RANGES = {
     "exposures": (1, 100),
     "depth_every": (0, 1_000_000),
 }
-"""What can be filmed. Beyond, a camera would have no room in memory, or stand under the table or within the object."""
+"""What can be recorded. Beyond, images do not fit into memory, or the camera is below the table or in the object."""
 
 
 @dataclass(frozen=True)
-class FilmConfig:
-    """How a lever-up is filmed."""
+class RecordingConfig:
+    """How a lever-up is recorded."""
 
     camera: PinholeCamera = WEBCAM
     """The camera's true intrinsics."""
@@ -72,15 +72,15 @@ class FilmConfig:
     frames_per_second: float = 30.0
     """Frames per second."""
     lead_time: float = 0.4
-    """Time filmed before the blade's path starts [s]."""
+    """Time recorded before the blade's path starts [s]."""
     tail_time: float = 0.1
-    """Time filmed after its end [s]; below 0, the film ends before."""
+    """Time recorded after its end [s]; below 0, the recording ends before."""
     exposures: int = 2
     """Moments within a hundredth of a second that are blended into one frame: motion blur."""
     depth_every: int = 1
-    """Depth is filmed with every so many colour frames; 0: never."""
+    """Colour frames from one with depth to the next; 0: no depth."""
     faults: Faults = field(default_factory=Faults)
-    """What spoils the pictures."""
+    """What spoils the images."""
     shadows: bool = False
     """A slanted lamp of some size casts soft shadows."""
     table: TableTop = "plain"
@@ -92,11 +92,11 @@ class FilmConfig:
     largest_side: float = 0.045
     """Side of the object's marker, if it has room [m]."""
     simulation: SimulationConfig = field(default_factory=lambda: SimulationConfig(embodiment="tool"))
-    """How the lever-up is simulated; MuJoCo alone can film."""
+    """How the lever-up is simulated; MuJoCo alone can record."""
 
     def __post_init__(self) -> None:
         if self.simulation.engine != "mujoco":
-            raise SimulationError(f"engine {self.simulation.engine!r} cannot film: take mujoco")
+            raise SimulationError(f"engine {self.simulation.engine!r} cannot record: take mujoco")
         given = {"width": self.camera.width}
         given |= {name: getattr(self, name) for name in RANGES if name != "width"}
         for name, value in given.items():
@@ -106,11 +106,11 @@ class FilmConfig:
 
 
 @dataclass(frozen=True)
-class FilmTruth:
-    """What a film shows, known exactly."""
+class RecordingTruth:
+    """What a recording shows, known exactly."""
 
     interaction: Interaction
-    """The lever-up that was filmed."""
+    """The lever-up that was recorded."""
     times: Float[np.ndarray, " frame"]
     """Time stamps [s]."""
     T_table_object: Float[np.ndarray, "frame 4 4"]
@@ -138,10 +138,15 @@ class FilmTruth:
         }
 
 
-def film_lever_up(
-    obj: ObjectModel, action: LeverUp, folder: Path, config: FilmConfig = FilmConfig(), *, seed: int = 0
-) -> FilmTruth:
-    """Films a simulated lever-up into a folder: frames, time stamps, background, marker layout, and the truth.
+def record_lever_up(
+    obj: ObjectModel,
+    action: LeverUp,
+    folder: Path,
+    config: RecordingConfig = RecordingConfig(),
+    *,
+    seed: int = 0,
+) -> RecordingTruth:
+    """Record a simulated lever-up into a folder: frames, time stamps, background, marker layout, and the truth.
 
     The camera's intrinsics are left out: they are to be found by calibration.
 
@@ -149,7 +154,7 @@ def film_lever_up(
         obj: The object.
         action: The lever-up.
         folder: An empty or new folder.
-        config: How it is filmed.
+        config: How it is recorded.
         seed: Seed of the noise, of where marker and lamp are, of the clock, and of the table's pattern.
 
     Raises:
@@ -175,12 +180,12 @@ def film_lever_up(
     poses = _interpolate(motion, times - action_start)[0]
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
-        film_folder.write_picture(
-            folder / film_folder.BACKGROUND, _background(lens, obj, motion, config, rng)
+        recording_folder.write_image(
+            folder / recording_folder.BACKGROUND, _background(lens, obj, motion, config, rng)
         )
         frames = _frames(lens, obj, motion, times, action_start, config, rng)
-        write_film(folder, frames, FilmNotes(action_start=None))
-    truth = FilmTruth(
+        write_recording(folder, frames, RecordingNotes(action_start=None))
+    truth = RecordingTruth(
         interaction,
         times,
         T_table_action @ pose_to_matrix(poses),
@@ -189,13 +194,13 @@ def film_lever_up(
         action_start,
     )
     layout = _layout(T_table_action, side, config)
-    for name, content in (("truth.json", truth.to_dict()), (film_folder.MARKERS, layout)):
-        (folder / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    for name, content in (("truth.json", truth.to_dict()), (recording_folder.MARKERS, layout)):
+        write_json(folder / name, content)
     return truth
 
 
-def film_board(
-    picture: UInt8[np.ndarray, "rows columns"],
+def photograph_board(
+    image: UInt8[np.ndarray, "rows columns"],
     size: tuple[float, float],
     camera: PinholeCamera = WEBCAM,
     num: int = 15,
@@ -203,13 +208,13 @@ def film_board(
     *,
     seed: int = 0,
 ) -> Iterator[UInt8[np.ndarray, "rows columns 3"]]:
-    """Pictures of a printed board held before a camera, slanted this way and that.
+    """Images of a printed board held before a camera, slanted this way and that.
 
     Args:
-        picture: What is printed on it, in grey.
+        image: What is printed on it, in grey.
         size: Width and height of the print [m].
         camera: The camera's true intrinsics.
-        num: Number of pictures.
+        num: Number of images.
         faults: What spoils them.
         seed: Seed of the poses and of the noise.
     """
@@ -220,11 +225,11 @@ def film_board(
     board = spec.worldbody.add_body(name="board")
     board.add_freejoint()
     board.mass, board.inertia, board.explicitinertial = 1.0, [1.0, 1.0, 1.0], True
-    margin = round(0.05 * max(picture.shape))
-    metres = size[0] / picture.shape[1]
-    paper = np.pad(picture, margin, constant_values=255)
+    margin = round(0.05 * max(image.shape))
+    metres = size[0] / image.shape[1]
+    paper = np.pad(image, margin, constant_values=255)
     whole = (metres * paper.shape[1], metres * paper.shape[0])
-    add_picture(board, spec, "board", paper, whole, np.array([0.0, 0, 0, 1, 0, 0, 0]))
+    add_image(board, spec, "board", paper, whole, np.array([0.0, 0, 0, 1, 0, 0, 0]))
     with LensCamera(spec, camera, np.eye(4)) as lens:
         for _ in range(num):
             lens.data.qpos[:] = matrix_to_pose(_held(camera, max(size), rng))
@@ -232,7 +237,7 @@ def film_board(
 
 
 def _held(camera: PinholeCamera, size: float, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
-    """A pose in which a board of that size fills a good part of the picture."""
+    """A pose in which a board of that size fills a good part of the image."""
     pixel = rng.uniform([0.3, 0.3], [0.7, 0.7]) * [camera.width, camera.height]
     distance = rng.uniform(1.1, 1.9) * size * camera.fx / camera.width * 1.6
     turn, _ = cv2.Rodrigues(rng.uniform([-0.6, -0.6, -0.4], [0.6, 0.6, 0.4]))
@@ -242,7 +247,7 @@ def _held(camera: PinholeCamera, size: float, rng: np.random.Generator) -> Float
     return pose
 
 
-def camera_pose(config: FilmConfig) -> Float[np.ndarray, "4 4"]:
+def camera_pose(config: RecordingConfig) -> Float[np.ndarray, "4 4"]:
     """T_action_camera: looking at a point 8 cm ahead of the contact point."""
     aim = np.array([0.08, 0.0, 0.0])
     horizontal = np.array([np.cos(config.azimuth), np.sin(config.azimuth), 0.0])
@@ -267,11 +272,11 @@ def marker_spot(
     return pose_to_matrix(pose), side
 
 
-def marker_picture(id: int) -> UInt8[np.ndarray, "rows columns"]:
+def marker_image(id: int) -> UInt8[np.ndarray, "rows columns"]:
     """A marker with its white margin."""
     markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    inner = cv2.aruco.generateImageMarker(markers, id, MODULES * PICTURE_PIXELS, borderBits=1)
-    return np.pad(inner, PICTURE_PIXELS, constant_values=255)
+    inner = cv2.aruco.generateImageMarker(markers, id, MODULES * IMAGE_PIXELS, borderBits=1)
+    return np.pad(inner, IMAGE_PIXELS, constant_values=255)
 
 
 def _add_markers(
@@ -279,18 +284,18 @@ def _add_markers(
     obj: ObjectModel,
     T_object_marker: Float[np.ndarray, "4 4"],
     side: float,
-    config: FilmConfig,
+    config: RecordingConfig,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "4 4"]:
     """Puts the markers into the scene; returns T_action_table, the first table marker's pose."""
     paper = (MODULES + 2) / MODULES
     on_body = T_object_marker.copy()
     on_body[:3, 3] -= body_origin(obj) + np.array([0.0, 0.0, SLAB / 2])
-    add_picture(
+    add_image(
         spec.body("object"),
         spec,
         "tag",
-        marker_picture(OBJECT_ID),
+        marker_image(OBJECT_ID),
         (paper * side, paper * side),
         matrix_to_pose(on_body),
     )
@@ -299,12 +304,12 @@ def _add_markers(
     size = (paper * config.table_side, paper * config.table_side)
     for id, spot in enumerate(TABLE_SPOTS):
         pose = np.array([*spot, SLAB / 2, *turn])
-        add_picture(spec.worldbody, spec, f"tag_{id}", marker_picture(id), size, pose)
+        add_image(spec.worldbody, spec, f"tag_{id}", marker_image(id), size, pose)
     return pose_to_matrix(np.array([*TABLE_SPOTS[0], SLAB, *turn]))
 
 
-def _layout(T_table_action: Float[np.ndarray, "4 4"], side: float, config: FilmConfig) -> dict[str, Any]:
-    """The marker layout, as somebody with a ruler would write it."""
+def _layout(T_table_action: Float[np.ndarray, "4 4"], side: float, config: RecordingConfig) -> dict[str, Any]:
+    """The marker layout, as measured with a ruler."""
     spots = np.column_stack([TABLE_SPOTS, np.zeros(len(TABLE_SPOTS))])
     in_table = spots @ T_table_action[:3, :3].T + T_table_action[:3, 3]
     table = [
@@ -341,7 +346,7 @@ def _frames(
     motion: Motion,
     times: Float[np.ndarray, " frame"],
     action_start: float,
-    config: FilmConfig,
+    config: RecordingConfig,
     rng: np.random.Generator,
 ) -> Iterator[Frame]:
     phase = rng.uniform(0, 2 * np.pi)
@@ -352,31 +357,29 @@ def _frames(
             _place(lens, obj, motion, time - action_start + offset)
             blended += lens.colours() / config.exposures
         light = np.sin(phase + 2 * np.pi * 0.3 * (time - times[0]))
-        picture = spoil(blended, config.faults, float(light), rng)
+        image = spoil(blended, config.faults, float(light), rng)
         depth = None
         if config.depth_every and number % config.depth_every == 0:
             _place(lens, obj, motion, time - action_start)
             depth = spoil_depth(lens.depths(), config.faults, rng)
-        yield Frame(round(float(time), 6), picture, depth)
+        yield Frame(round(float(time), 6), image, depth)
 
 
 def _background(
-    lens: LensCamera, obj: ObjectModel, motion: Motion, config: FilmConfig, rng: np.random.Generator
+    lens: LensCamera, obj: ObjectModel, motion: Motion, config: RecordingConfig, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The table before the object was put there, in the mean of some pictures."""
+    """The table before the object was put there, in the mean of some images."""
     _place(lens, obj, motion, 0.0)
     lens.data.qpos[:3] = OUT_OF_SIGHT
     perfect = lens.colours()
-    pictures = [spoil(perfect, config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
-    return np.rint(np.mean(pictures, axis=0)).astype(np.uint8)
+    images = [spoil(perfect, config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
+    return np.rint(np.mean(images, axis=0)).astype(np.uint8)
 
 
 def _place(lens: LensCamera, obj: ObjectModel, motion: Motion, time: float) -> None:
     """Puts object and tool where they are at a time since the path's start."""
     pose, tool = (poses[0] for poses in _interpolate(motion, np.array([time])))
-    T_object_body = np.eye(4)
-    T_object_body[:3, 3] = body_origin(obj)
-    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ T_object_body)
+    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(obj), 0.0))
     if motion.joints.shape[1]:
         joints = [np.interp(time, motion.times, joint) for joint in motion.joints.T]
     else:

@@ -1,4 +1,4 @@
-"""Pictures in the messages of ROS 1 and ROS 2: raw and compressed, colour and depth."""
+"""Images in the messages of ROS 1 and ROS 2: raw and compressed, colour and depth."""
 
 import struct
 from pathlib import Path
@@ -23,7 +23,7 @@ MILLIMETRE = 0.001
 """Unit of depth in whole numbers (REP 118) [m]."""
 COMPRESSED_DEPTH = "compressedDepth"
 HEADER = struct.Struct("<iff")
-"""Before a compressed depth picture: its kind, and two numbers that tell depth from its steps."""
+"""Before a compressed depth image: its kind, and two numbers that tell depth from its steps."""
 
 
 def is_depth(message: Any) -> bool:
@@ -34,7 +34,7 @@ def is_depth(message: Any) -> bool:
 
 
 def read_colour(message: Any, path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The picture in a message (blue, green, red).
+    """The image in a message (blue, green, red).
 
     Args:
         message: An Image or CompressedImage.
@@ -45,9 +45,9 @@ def read_colour(message: Any, path: Path) -> UInt8[np.ndarray, "rows columns 3"]
     """
     if not hasattr(message, "encoding"):
         return _decode(bytes(message.data), cv2.IMREAD_COLOR, message, path)
-    picture = _raw(message, COLOURS, path)
+    image = _raw(message, COLOURS, path)
     code = TO_BGR.get(message.encoding)
-    return picture if code is None else cv2.cvtColor(picture, code)
+    return image if code is None else cv2.cvtColor(image, code)
 
 
 def read_depth(message: Any, path: Path) -> Float[np.ndarray, "rows columns"]:
@@ -94,12 +94,12 @@ def _compressed_depth(message: Any, path: Path) -> Float[np.ndarray, "rows colum
 
 
 def _decode(data: bytes, flags: int, message: Any, path: Path) -> Any:
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
-    if picture is None:
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    if image is None:
         raise PerceptionError(
             f"bag {path} holds a compressed image ({message.format}) that cannot be decoded"
         )
-    return picture
+    return image
 
 
 def _raw(message: Any, known: dict[str, tuple[str, int]], path: Path) -> Any:

@@ -1,4 +1,4 @@
-"""A filmed lever-up becomes an interaction, from a folder, a video or a bag; broken films are refused with a reason."""
+"""A recorded lever-up becomes an interaction; broken recordings are refused with a reason."""
 
 import csv
 import dataclasses
@@ -11,57 +11,38 @@ import numpy as np
 import pytest
 
 import factories
-from foretrace.actions import LeverUp
 from foretrace.cli import main
-from foretrace.cli.recordings import LookedAt, look_at_photo
-from foretrace.errors import DatasetError, PerceptionError, SimulationError
+from foretrace.errors import DatasetError, PerceptionError
 from foretrace.geometry import rotation_angle
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
-from foretrace.interactions.film_folder import FilmNotes, Frame, write_film
 from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.recorded import add_recorded
+from foretrace.interactions.recording_folder import Frame, RecordingNotes, write_recording
 from foretrace.interactions.topdown import TopDownView
-from foretrace.objects import Prism
-from foretrace.perception.films import open_film
-from foretrace.perception.importing import Contact, ImportConfig, Imported, import_film
+from foretrace.perception.importing import Contact, ImportConfig, Imported, import_recording
 from foretrace.perception.markers import MarkerLayout
 from foretrace.perception.overlay import write_video
-from foretrace.simulation.film import FilmConfig, FilmTruth, film_lever_up
-from foretrace.simulation.lens import Faults
+from foretrace.perception.recordings import open_recording
+from foretrace.simulation.recording import RecordingTruth
+from recorded_scene import ACTION, CAMERA, CONFIG, PRISM, contact_pixel
 
-CAMERA = PinholeCamera(800, 450, 580.0, 581.0, 402.0, 223.0, (0.05, -0.1, 0.0005, -0.0005, 0.02))
-PRISM = Prism([(0.09, -0.02), (0.05, 0.07), (-0.03, 0.08), (-0.09, 0.0), (-0.02, -0.08)])
-ACTION = LeverUp.at_edge(PRISM, 2, 0.5)
 CONTACT = Contact(point=(float(ACTION.contact[0]), float(ACTION.contact[1])))
-CONFIG = FilmConfig(
-    CAMERA, distance=0.6, frames_per_second=10.0, exposures=1, depth_every=40, faults=Faults(blur=0.5)
-)
 
 
 @pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FilmTruth]:
-    folder = tmp_path_factory.mktemp("films") / "film"
-    try:
-        truth = film_lever_up(PRISM, ACTION, folder, CONFIG, seed=3)
-    except SimulationError as error:
-        pytest.skip(str(error))
-    CAMERA.save(folder / "camera.json")
-    (folder / "object.json").write_text(json.dumps(PRISM.to_dict()))
-    return folder, truth
-
-
-@pytest.fixture(scope="module")
-def imported(film: tuple[Path, FilmTruth]) -> Imported:
-    folder, _ = film
-    return import_film(open_film(folder), CAMERA, MarkerLayout.load(folder / "markers.json"), CONTACT, PRISM)
+def imported(recorded: tuple[Path, RecordingTruth]) -> Imported:
+    folder, _ = recorded
+    return import_recording(
+        open_recording(folder), CAMERA, MarkerLayout.load(folder / "markers.json"), CONTACT, PRISM
+    )
 
 
 def some_of(folder: Path, new: Path, **changes: object) -> Path:
-    """A copy of a film without its pictures' names changed; ``frames`` keeps the first so many."""
+    """A copy of a recording without its images' names changed; ``frames`` keeps the first so many."""
     shutil.copytree(folder, new)
     rows = list(csv.reader((new / "timestamps.csv").read_text().splitlines()))
     rows = rows[: 1 + int(str(changes.get("frames", 10)))]
@@ -71,11 +52,13 @@ def some_of(folder: Path, new: Path, **changes: object) -> Path:
 
 
 def look(folder: Path, camera: PinholeCamera = CAMERA) -> Imported:
-    return import_film(open_film(folder), camera, MarkerLayout.load(folder / "markers.json"), CONTACT, PRISM)
+    return import_recording(
+        open_recording(folder), camera, MarkerLayout.load(folder / "markers.json"), CONTACT, PRISM
+    )
 
 
-def test_the_object_is_where_it_was(film: tuple[Path, FilmTruth], imported: Imported) -> None:
-    _, truth = film
+def test_the_object_is_where_it_was(recorded: tuple[Path, RecordingTruth], imported: Imported) -> None:
+    _, truth = recorded
     apart = np.linalg.norm(imported.T_table_object[:, :3, 3] - truth.T_table_object[:, :3, 3], axis=1)
     angle = rotation_angle(imported.T_table_object[:, :3, :3], truth.T_table_object[:, :3, :3])
     assert np.median(apart) < 0.001
@@ -84,8 +67,10 @@ def test_the_object_is_where_it_was(film: tuple[Path, FilmTruth], imported: Impo
     np.testing.assert_allclose(imported.T_table_camera[:3, 3], truth.T_table_camera[:3, 3], atol=0.002)
 
 
-def test_the_interaction_is_that_of_the_simulation(film: tuple[Path, FilmTruth], imported: Imported) -> None:
-    _, truth = film
+def test_the_interaction_is_that_of_the_simulation(
+    recorded: tuple[Path, RecordingTruth], imported: Imported
+) -> None:
+    _, truth = recorded
     found, exact = imported.interaction, truth.interaction
     assert found.provenance.source == "recorded"
     assert found.effect.outcome == exact.effect.outcome == Outcome.LEVERED
@@ -99,9 +84,12 @@ def test_the_interaction_is_that_of_the_simulation(film: tuple[Path, FilmTruth],
 
 
 def test_recordings_are_data_like_any_other(
-    film: tuple[Path, FilmTruth], imported: Imported, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recorded: tuple[Path, RecordingTruth],
+    imported: Imported,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder, _ = film
+    folder, _ = recorded
     out = tmp_path / "data"
     command = [
         "import",
@@ -132,15 +120,13 @@ def test_recordings_are_data_like_any_other(
         add_recorded(tmp_path / "simulated", imported.interaction, {})
 
 
-def test_an_unknown_object_is_taken_from_its_outline(film: tuple[Path, FilmTruth]) -> None:
-    folder, truth = film
-    rim = truth.T_table_object[0] @ [*ACTION.contact, PRISM.height, 1.0]
-    pixel = CAMERA.project(rim[None, :3], np.linalg.inv(truth.T_table_camera))[0]
-    found = import_film(
-        open_film(folder),
+def test_an_unknown_object_is_taken_from_its_outline(recorded: tuple[Path, RecordingTruth]) -> None:
+    folder, truth = recorded
+    found = import_recording(
+        open_recording(folder),
         CAMERA,
         MarkerLayout.load(folder / "markers.json"),
-        Contact(pixel=(float(pixel[0]), float(pixel[1]))),
+        Contact(pixel=contact_pixel(truth)),
     )
     exact = TopDownView.of(PRISM, ACTION)
     view = found.interaction.view
@@ -148,8 +134,10 @@ def test_an_unknown_object_is_taken_from_its_outline(film: tuple[Path, FilmTruth
     assert found.interaction.object.height == pytest.approx(PRISM.height, abs=0.002)
 
 
-def test_broken_films_are_refused_with_a_reason(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
-    folder, _ = film
+def test_broken_recordings_are_refused_with_a_reason(
+    recorded: tuple[Path, RecordingTruth], tmp_path: Path
+) -> None:
+    folder, _ = recorded
     short = some_of(folder, tmp_path / "short", frames=8)
     with pytest.raises(PerceptionError, match="never moves by a millimetre"):
         look(short)
@@ -161,32 +149,32 @@ def test_broken_films_are_refused_with_a_reason(film: tuple[Path, FilmTruth], tm
     with pytest.raises(PerceptionError, match="do not increase: frame 4"):
         look(short)
     table.write_text("\n".join([lines[0], *(line.replace("colour-00002", "gone") for line in lines[1:])]))
-    with pytest.raises(PerceptionError, match="cannot read a picture"):
+    with pytest.raises(PerceptionError, match="cannot read an image"):
         look(short)
     table.write_text("time\n1")
     with pytest.raises(PerceptionError, match="its columns are time_s, colour, depth"):
         look(short)
     with pytest.raises(PerceptionError, match="no recording at"):
-        open_film(tmp_path / "nothing")
+        open_recording(tmp_path / "nothing")
     with pytest.raises(PerceptionError, match="is no recording that can be read"):
-        open_film(folder / "markers.json")
+        open_recording(folder / "markers.json")
 
 
-def test_why_no_marker_is_found(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
-    folder, _ = film
+def test_why_no_marker_is_found(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
+    folder, _ = recorded
     few = some_of(folder, tmp_path / "few", frames=3)
     layout = json.loads((few / "markers.json").read_text())
     (few / "markers.json").write_text(json.dumps(layout | {"dictionary": "4x4_50"}))
-    with pytest.raises(PerceptionError, match="has markers of apriltag_36h11"):
+    with pytest.raises(PerceptionError, match="its markers are of apriltag_36h11, not 4x4_50"):
         look(few)
     (few / "markers.json").write_text(json.dumps(layout | {"object": [{"id": 77, "side": 0.04}]}))
     with pytest.raises(PerceptionError, match=r"markers \[77\] are seen in 0 of 3 frames.*seen are \["):
         look(few)
     (few / "markers.json").write_text(json.dumps(layout))
     for name, spoil, reason in (
-        ("dark", lambda picture: picture // 20, "it is dark"),
-        ("blurred", lambda picture: cv2.GaussianBlur(picture, (0, 0), 12), "it is blurred"),
-        ("empty", lambda picture: np.full_like(picture, 200), "it is blurred or empty"),
+        ("dark", lambda image: image // 20, "it is dark"),
+        ("blurred", lambda image: cv2.GaussianBlur(image, (0, 0), 12), "it is blurred"),
+        ("empty", lambda image: np.full_like(image, 200), "it is blurred or empty"),
     ):
         copy = tmp_path / name
         shutil.copytree(few, copy)
@@ -196,8 +184,8 @@ def test_why_no_marker_is_found(film: tuple[Path, FilmTruth], tmp_path: Path) ->
             look(copy)
 
 
-def test_wrong_sides_and_gaps_are_noticed(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
-    folder, _ = film
+def test_wrong_sides_and_gaps_are_noticed(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
+    folder, _ = recorded
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     layout = json.loads((copy / "markers.json").read_text())
@@ -212,48 +200,35 @@ def test_wrong_sides_and_gaps_are_noticed(film: tuple[Path, FilmTruth], tmp_path
         look(copy)
 
 
-def test_videos(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
-    folder, _ = film
+def test_videos(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
+    folder, _ = recorded
     path = tmp_path / "film.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (800, 450))
-    pictures = [frame.picture for frame in open_film(folder).frames()][:12]
-    for picture in pictures:
-        writer.write(picture)
+    images = [frame.image for frame in open_recording(folder).frames()][:12]
+    for image in images:
+        writer.write(image)
     writer.release()
-    frames = list(open_film(path).frames())
+    frames = list(open_recording(path).frames())
     np.testing.assert_allclose([frame.time for frame in frames], 0.1 * np.arange(12), atol=1e-3)
-    assert np.abs(frames[3].picture.astype(int) - pictures[3]).mean() < 5
+    assert np.abs(frames[3].image.astype(int) - images[3]).mean() < 5
     content = path.read_bytes()
     (tmp_path / "half.avi").write_bytes(content[: len(content) // 2])
     with pytest.raises(PerceptionError, match=r"is cut off|cannot be opened"):
-        list(open_film(tmp_path / "half.avi").frames())
+        list(open_recording(tmp_path / "half.avi").frames())
     (tmp_path / "none.mp4").write_bytes(b"no video")
     with pytest.raises(PerceptionError, match="cannot be opened"):
-        list(open_film(tmp_path / "none.mp4").frames())
+        list(open_recording(tmp_path / "none.mp4").frames())
 
 
-def test_a_photograph_of_an_object_without_height_is_refused(film: tuple[Path, FilmTruth]) -> None:
-    folder, truth = film
-    rim = truth.T_table_object[0] @ [*ACTION.contact, PRISM.height, 1.0]
-    column, row = CAMERA.project(rim[None, :3], np.linalg.inv(truth.T_table_camera))[0]
-    photo, background = folder / "colour-00000.jpg", folder / "background.png"
-
-    def look_at(height: float | None) -> LookedAt:
-        pixel = (float(column), float(row))
-        return look_at_photo(photo, None, None, height, pixel, "background", background, None, False)
-
-    assert look_at(None).sight.placed.object.height == 0.02
-    with pytest.raises(PerceptionError, match=r"object from 0\.0 to 0\.0 m high"):
-        look_at(0.0)
-
-
-def test_depth_helps_where_the_background_does_not_tell(film: tuple[Path, FilmTruth], tmp_path: Path) -> None:
-    folder = shutil.copytree(film[0], tmp_path / "film")
+def test_depth_helps_where_the_background_does_not_tell(
+    recorded: tuple[Path, RecordingTruth], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(recorded[0], tmp_path / "film")
     cv2.imwrite(str(folder / "background.png"), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
     layout, contact = MarkerLayout.load(folder / "markers.json"), Contact(edge=(2, 0.5))
-    with pytest.warns(UserWarning, match="found by depth, since by background: .* of the picture differ"):
-        found = import_film(open_film(folder), CAMERA, layout, contact, PRISM)
-    off = found.T_table_object[0, :3, 3] - film[1].T_table_object[0, :3, 3]
+    with pytest.warns(UserWarning, match="found by depth, since by background: .* of the image differ"):
+        found = import_recording(open_recording(folder), CAMERA, layout, contact, PRISM)
+    off = found.T_table_object[0, :3, 3] - recorded[1].T_table_object[0, :3, 3]
     assert np.linalg.norm(off) < 0.003
 
 
@@ -264,8 +239,10 @@ def test_an_action_is_said_once() -> None:
         Contact(point=(0.0, 0.0), edge=(1, 0.5))
 
 
-def test_outcomes_from_motion_alone_agree_with_those_that_saw_the_blade(film: tuple[Path, FilmTruth]) -> None:
-    effect = film[1].interaction.effect
+def test_outcomes_from_motion_alone_agree_with_those_that_saw_the_blade(
+    recorded: tuple[Path, RecordingTruth],
+) -> None:
+    effect = recorded[1].interaction.effect
     assert judge_motion(PRISM, effect.pose_trajectory, effect.com_trajectory) == (Outcome.LEVERED, None)
     dropped = effect.pose_trajectory.copy()
     dropped[40:] = dropped[0]
@@ -318,13 +295,11 @@ def test_a_film_does_not_take_the_place_of_a_file(tmp_path: Path, capsys: pytest
     assert out.read_text() == "kept"
 
 
-def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_image_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     frames = [Frame(0.0, np.zeros((4, 4, 3), np.uint8))]
-    (
-        tmp_path / "colour-00000.jpg"
-    ).mkdir()  # a folder is where the picture should be, as a full disk would be
+    (tmp_path / "colour-00000.jpg").mkdir()  # a folder is where the image should be, as a full disk would be
     with pytest.raises(PerceptionError, match=r"cannot write .*colour-00000\.jpg"):
-        write_film(tmp_path, frames, FilmNotes())
+        write_recording(tmp_path, frames, RecordingNotes())
     (tmp_path / "film.mp4").mkdir()
     with pytest.raises(PerceptionError, match=r"cannot write .*film\.mp4: check the folder"):
         write_video(tmp_path / "film.mp4", [np.zeros((64, 64, 3), np.uint8)] * 100, 10.0)

@@ -1,4 +1,4 @@
-"""Pictures of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
+"""Images of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs.
@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foretrace.errors import ExportError, SimulationError
-from foretrace.geometry import matrix_to_pose, pose_to_matrix
+from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
-from foretrace.simulation.camera import make_renderer
+from foretrace.simulation.camera import make_renderer, render
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.tool import Tool, add_blade
 
@@ -26,8 +26,8 @@ CAMERA_AIM = np.array([0.04, 0.0, 0.04])
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """What a colour and depth camera sees, picture by picture."""
+class RenderedImages:
+    """What a colour and depth camera sees, image by image."""
 
     rgb: UInt8[np.ndarray, "time rows columns 3"]
     """Colour."""
@@ -51,11 +51,11 @@ def camera_pose() -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def take_pictures(
+def render_images(
     interaction: Interaction,
     object_poses: Float[np.ndarray, "time 7"],
     tool_poses: Float[np.ndarray, "time 7"],
-) -> Pictures:
+) -> RenderedImages:
     """Renders a simulated interaction: object, screwdriver and table, without the arm.
 
     Args:
@@ -78,25 +78,17 @@ def take_pictures(
     model = spec.compile()
     model.cam_fovy[0] = np.rad2deg(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
     data = mujoco.MjData(model)
-    T_object_body = np.eye(4)
-    T_object_body[:3, 3] = body_origin(obj)
-    bodies = matrix_to_pose(pose_to_matrix(object_poses) @ T_object_body)
+    bodies = matrix_to_pose(pose_to_matrix(object_poses) @ planar_transform(body_origin(obj), 0.0))
     shape = (len(bodies), CAMERA.height, CAMERA.width)
     rgb, depth = np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
     try:
         renderer = make_renderer(model, CAMERA.height, CAMERA.width)
     except SimulationError as error:
-        raise ExportError(f"{error}; or export without pictures: --no-camera") from error
+        raise ExportError(f"{error}; or export without images: --no-camera") from error
     with renderer:
         for k in range(len(bodies)):
             data.qpos[:] = np.concatenate([bodies[k], tool_poses[k]])
             mujoco.mj_forward(model, data)
-            for wanted in (rgb, depth):
-                if wanted is depth:
-                    renderer.enable_depth_rendering()
-                renderer.update_scene(data, camera="beside")
-                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-                wanted[k] = renderer.render()
-                renderer.disable_depth_rendering()
-    return Pictures(rgb, depth, CAMERA, pose)
+            rgb[k] = render(renderer, data, "beside")
+            depth[k] = render(renderer, data, "beside", depth=True)
+    return RenderedImages(rgb, depth, CAMERA, pose)

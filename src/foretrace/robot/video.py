@@ -1,6 +1,5 @@
-"""Film a motion while it happens, into the folder format that `interactions.film_folder` defines."""
+"""Record a motion while it happens, into the folder format that `interactions.recording_folder` defines."""
 
-import json
 import threading
 import time
 import warnings
@@ -11,21 +10,21 @@ from types import TracebackType
 import cv2
 
 from foretrace.errors import PerceptionError, RobotError
-from foretrace.interactions.film_folder import DEPTH_UNIT, NOTES, FilmNotes, Frame, write_film
+from foretrace.interactions.recording_folder import DEPTH_UNIT, Frame, RecordingNotes, write_recording
 
 PATIENCE = 5.0
 """How long the first and the last frame may take [s]."""
 
 
-class Filming:
-    """A camera that films between the beginning and the end of a ``with`` block, beside everything else.
+class VideoRecorder:
+    """A camera that records between the beginning and the end of a ``with`` block, beside everything else.
 
     Args:
         source: Number of a camera, or whatever else OpenCV opens: a device, a stream's address, a video file.
         folder: An empty or new folder for the frames.
 
     Raises:
-        RobotError: If the camera gives no picture, or the folder is in use.
+        RobotError: If the camera gives no image, or the folder is in use.
     """
 
     def __init__(self, source: str, folder: Path) -> None:
@@ -34,14 +33,14 @@ class Filming:
         self._capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
         if not self._capture.grab():
             raise RobotError(
-                f"camera {source} gives no picture: choose a number, a device or a file that OpenCV opens"
+                f"camera {source} gives no image: choose a number, a device or a file that OpenCV opens"
             )
         self._folder, self._first, self._finish = folder, threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._film, daemon=True)
+        self._thread = threading.Thread(target=self._record, daemon=True)
         self.action_start: float | None = None
         """When the blade's path started, by this machine's monotonic clock [s]."""
 
-    def __enter__(self) -> "Filming":
+    def __enter__(self) -> "VideoRecorder":
         self._thread.start()
         self._first.wait(PATIENCE)
         return self
@@ -51,25 +50,24 @@ class Filming:
     ) -> None:
         if not self._thread.is_alive():
             warnings.warn(
-                f"the camera gave no more pictures before the motion was over: {self._folder}", stacklevel=2
+                f"the camera gave no more images before the motion was over: {self._folder}", stacklevel=2
             )
         self._finish.set()
         self._thread.join(PATIENCE)
         self._capture.release()
-        notes = {"depth_unit": DEPTH_UNIT, "action_start": self.action_start}
-        (self._folder / NOTES).write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+        RecordingNotes(DEPTH_UNIT, self.action_start).save(self._folder)
 
-    def _film(self) -> None:
+    def _record(self) -> None:
         try:
-            write_film(self._folder, self._frames(), FilmNotes())
-        except PerceptionError as error:  # the motion matters more than its film
+            write_recording(self._folder, self._frames(), RecordingNotes())
+        except PerceptionError as error:  # the motion matters more than its recording
             warnings.warn(str(error), stacklevel=2)
 
     def _frames(self) -> Iterator[Frame]:
         """Frames as they come, stamped with this machine's monotonic clock."""
         while not self._finish.is_set():
-            seen, picture = self._capture.read()
+            seen, image = self._capture.read()
             if not seen:
                 return
-            yield Frame(time.monotonic(), picture)
+            yield Frame(time.monotonic(), image)
             self._first.set()

@@ -7,7 +7,7 @@ from jaxtyping import Float, Shaped
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 PIXEL_STRIDE = 4
-"""Of a picture's rows and columns every such one is counted."""
+"""Of an image's rows and columns every such one is counted."""
 
 Statistics = dict[str, np.ndarray]
 """Minimum, maximum, mean, standard deviation, count and quantiles of a feature."""
@@ -19,15 +19,15 @@ def vector_statistics(values: Shaped[np.ndarray, "frames *size"]) -> Statistics:
     return _statistics(rows, len(values))
 
 
-def picture_statistics(pictures: Shaped[np.ndarray, "frames rows columns channels"]) -> Statistics:
-    """Of pictures, per channel over frames and pixels, shaped (channels, 1, 1).
+def image_statistics(images: Shaped[np.ndarray, "frames rows columns channels"]) -> Statistics:
+    """Of images, per channel over frames and pixels, shaped (channels, 1, 1).
 
     Colours (uint8) are counted from 0 to 1, depths in their own unit.
     """
-    few = pictures[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE]
-    scale = 255.0 if pictures.dtype == np.uint8 else 1.0
-    pixels = few.reshape(-1, pictures.shape[-1]) / scale
-    found = _statistics(pixels, len(pictures))
+    few = images[:, ::PIXEL_STRIDE, ::PIXEL_STRIDE]
+    scale = 255.0 if images.dtype == np.uint8 else 1.0
+    pixels = few.reshape(-1, images.shape[-1]) / scale
+    found = _statistics(pixels, len(images))
     return {name: value if name == "count" else value[:, None, None] for name, value in found.items()}
 
 

@@ -1,4 +1,4 @@
-"""Films to read: a folder of frames with time stamps, a video, or a ROS bag."""
+"""Recordings to read: a folder of frames with time stamps, a video, or a ROS bag."""
 
 import csv
 from collections.abc import Callable, Iterator
@@ -10,42 +10,41 @@ import numpy as np
 from jaxtyping import UInt8
 
 from foretrace.errors import PerceptionError
-from foretrace.interactions import film_folder
-from foretrace.interactions.film_folder import FilmNotes, Frame
+from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.recording_folder import Frame, RecordingNotes, read_depth, read_image
 from foretrace.perception import realsense
-from foretrace.perception.calibration import read_picture
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 BAGS = (".bag", ".mcap", ".db3")
 
 
 @dataclass(frozen=True)
-class Film:
+class Recording:
     """Frames in order, and what lies beside them."""
 
     path: Path
     """Where it was read from."""
     frames: Callable[[], Iterator[Frame]]
     """Reads the frames, from the beginning each time."""
-    notes: FilmNotes = field(default_factory=FilmNotes)
-    """What the film says about itself."""
+    notes: RecordingNotes = field(default_factory=RecordingNotes)
+    """Its notes."""
     camera: PinholeCamera | None = None
-    """The camera, if the film names it."""
+    """The camera, if the recording names it."""
 
     def beside(self, name: str) -> Path | None:
-        """A file that belongs to the film, if it is there."""
+        """A file that belongs to the recording, if it is there."""
         folder = self.path if self.path.is_dir() else self.path.parent
         return folder / name if (folder / name).is_file() else None
 
     def background(self) -> UInt8[np.ndarray, "rows columns 3"] | None:
-        """The table before the object was put there, if the film has it."""
-        path = self.beside(film_folder.BACKGROUND)
-        return None if path is None else read_picture(path)
+        """The table before the object was put there, if the recording has it."""
+        path = self.beside(recording_folder.BACKGROUND)
+        return None if path is None else read_image(path)
 
 
-def open_film(path: str | Path, topic: str | None = None, depth_topic: str | None = None) -> Film:
-    """A film of any of the kinds that are read.
+def open_recording(path: str | Path, topic: str | None = None, depth_topic: str | None = None) -> Recording:
+    """A recording of any of the kinds that are read.
 
     Args:
         path: A folder with ``timestamps.csv``, a video file, a bag of ROS 1 or ROS 2, or a RealSense
@@ -60,54 +59,50 @@ def open_film(path: str | Path, topic: str | None = None, depth_topic: str | Non
     if not path.exists():
         raise PerceptionError(f"no recording at {path}: check the path")
     if path.suffix.lower() in BAGS and path.is_file() and realsense.is_recording(path):
-        frames, camera = realsense.open_recording(path)
-        return Film(path, frames, camera=camera)
+        frames, camera = realsense.open_realsense(path)
+        return Recording(path, frames, camera=camera)
     if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
         from foretrace.perception.bags import open_bag
 
         frames, camera = open_bag(path, topic, depth_topic)
-        return Film(path, frames, camera=camera)
+        return Recording(path, frames, camera=camera)
     if path.is_dir():
-        notes = FilmNotes.load(path)
-        stored = path / film_folder.CAMERA
+        notes = RecordingNotes.load(path)
+        stored = path / recording_folder.CAMERA
         camera = PinholeCamera.load(stored) if stored.is_file() else None
         rows = _read_times(path)
-        return Film(path, lambda: _folder_frames(path, rows, notes), notes, camera)
+        return Recording(path, lambda: _folder_frames(path, rows), notes, camera)
     if path.suffix.lower() in VIDEOS:
-        return Film(path, lambda: _video_frames(path))
-    kinds = f"a folder with {film_folder.TIMES}, a video ({', '.join(VIDEOS)}) or a bag ({', '.join(BAGS)})"
+        return Recording(path, lambda: _video_frames(path))
+    kinds = (
+        f"a folder with {recording_folder.TIMES}, a video ({', '.join(VIDEOS)}) or a bag ({', '.join(BAGS)})"
+    )
     raise PerceptionError(f"{path} is no recording that can be read: give {kinds}")
 
 
 def _read_times(folder: Path) -> list[tuple[float, str, str]]:
-    path = folder / film_folder.TIMES
+    path = folder / recording_folder.TIMES
     try:
         with open(path, newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
         found = [(float(row["time_s"]), row["colour"], row.get("depth") or "") for row in rows]
     except OSError as error:
         raise PerceptionError(
-            f"{folder} has no {film_folder.TIMES} ({error.strerror}): write a line per frame with "
-            f"{', '.join(film_folder.COLUMNS)}"
+            f"{folder} has no {recording_folder.TIMES} ({error.strerror}): write a line per frame with "
+            f"{', '.join(recording_folder.COLUMNS)}"
         ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise PerceptionError(
-            f"{path} cannot be read ({error!r}): its columns are {', '.join(film_folder.COLUMNS)}"
+            f"{path} cannot be read ({error!r}): its columns are {', '.join(recording_folder.COLUMNS)}"
         ) from error
     if not found:
         raise PerceptionError(f"{path} lists no frame")
     return found
 
 
-def _folder_frames(folder: Path, rows: list[tuple[float, str, str]], notes: FilmNotes) -> Iterator[Frame]:
-    for time, colour, depth_name in rows:
-        depth = None
-        if depth_name:
-            steps = cv2.imread(str(folder / depth_name), cv2.IMREAD_UNCHANGED)
-            if steps is None or steps.ndim != 2:
-                raise PerceptionError(f"cannot read a depth picture from {folder / depth_name}")
-            depth = steps.astype(float) * notes.depth_unit
-        yield Frame(time, read_picture(folder / colour), depth)
+def _folder_frames(folder: Path, rows: list[tuple[float, str, str]]) -> Iterator[Frame]:
+    for time, colour, depth in rows:
+        yield Frame(time, read_image(folder / colour), read_depth(folder / depth) if depth else None)
 
 
 def _video_frames(path: Path) -> Iterator[Frame]:
@@ -118,10 +113,10 @@ def _video_frames(path: Path) -> Iterator[Frame]:
     stated, count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0
     try:
         while True:
-            there, picture = video.read()
+            there, image = video.read()
             if not there:
                 break
-            yield Frame(video.get(cv2.CAP_PROP_POS_MSEC) / 1000, picture)  # of the frame just read
+            yield Frame(video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image)  # of the frame just read
             count += 1
     finally:
         video.release()

@@ -1,0 +1,151 @@
+"""A recording on disk: frames as images, their time stamps, and what is known about the camera and the markers.
+
+``timestamps.csv`` has a line for every frame: time [s], file of the colour image, and file of the depth image or
+nothing. ``camera.json``, ``markers.json``, ``film.json`` (unit of the depth images, time at which the blade starts),
+``background.png`` (the table before the object was put there) and ``object.json`` are optional.
+"""
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foretrace.errors import PerceptionError
+from foretrace.files import read_json, write_json
+
+TIMES = "timestamps.csv"
+COLUMNS = ("time_s", "colour", "depth")
+CAMERA, MARKERS, NOTES, BACKGROUND, OBJECT = (
+    "camera.json",
+    "markers.json",
+    "film.json",
+    "background.png",
+    "object.json",
+)
+DEPTH_UNIT = 0.0001
+"""Unit of the depth images that are written [m]."""
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of a film."""
+
+    time: float
+    """Time stamp [s]."""
+    image: UInt8[np.ndarray, "rows columns 3"]
+    """Colour: blue, green, red."""
+    depth: Float[np.ndarray, "rows columns"] | None = None
+    """Distance along the optical axis, pixel by pixel of the colour image [m]; 0: nothing seen."""
+
+
+@dataclass(frozen=True)
+class RecordingNotes:
+    """Unit of the depth images and start of the action."""
+
+    depth_unit: float = 0.001
+    """Unit of the depth images [m]."""
+    action_start: float | None = None
+    """Time stamp at which the blade's path starts [s]; None: not known."""
+
+    @classmethod
+    def load(cls, folder: Path) -> "RecordingNotes":
+        """The notes in a folder; the defaults where there are none.
+
+        Raises:
+            PerceptionError: They are damaged.
+        """
+        path = folder / NOTES
+        if not path.is_file():
+            return cls()
+        values = read_json(path, PerceptionError, "give depth_unit in metres")
+        try:
+            start = values.get("action_start")
+            return cls(float(values["depth_unit"]), None if start is None else float(start))
+        except (ValueError, KeyError, TypeError) as error:
+            raise PerceptionError(f"{path} cannot be read ({error!r}): give depth_unit in metres") from error
+
+    def save(self, folder: Path) -> None:
+        """Write the notes into a folder."""
+        write_json(folder / NOTES, asdict(self))
+
+
+def read_image(path: str | Path) -> UInt8[np.ndarray, "rows columns 3"]:
+    """An image as blue, green and red.
+
+    Raises:
+        PerceptionError: It is missing or cannot be read.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
+    if image is None:
+        raise PerceptionError(f"cannot read an image from {path}: give a whole PNG or JPEG file")
+    return image
+
+
+def read_depth(path: Path) -> Float[np.ndarray, "rows columns"]:
+    """A depth image [m], 0 where nothing was measured.
+
+    From a 16-bit PNG in millimetres (or in the unit that the notes beside it name), or a ``.npy`` array in metres.
+
+    Raises:
+        PerceptionError: It is missing, cannot be read, or is no such image.
+    """
+    remedy = "give a PNG of 16 bits per pixel in millimetres, or a .npy array (rows, columns) in metres"
+    if not path.is_file():
+        raise PerceptionError(f"depth image {path} does not exist: {remedy}")
+    if path.suffix.lower() == ".npy":
+        try:
+            metres = np.asarray(np.load(path, allow_pickle=False), dtype=float)
+        except (OSError, ValueError, TypeError) as error:
+            raise PerceptionError(f"cannot read a depth image from {path} ({error}): {remedy}") from error
+    else:
+        steps = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if steps is None or steps.dtype != np.uint16:
+            found = "no image" if steps is None else f"an image of {steps.dtype}"
+            raise PerceptionError(f"cannot read a depth image from {path}, which holds {found}: {remedy}")
+        metres = steps * RecordingNotes.load(path.parent).depth_unit
+    if metres.ndim != 2:
+        raise PerceptionError(
+            f"{path} has shape {metres.shape}, a depth image has rows and columns: {remedy}"
+        )
+    return np.where(np.isfinite(metres) & (metres > 0), metres, 0.0)
+
+
+def write_image(path: Path, image: np.ndarray, options: Sequence[int] = ()) -> None:
+    """Write an image, in the format that its name ends in.
+
+    Raises:
+        PerceptionError: It cannot be written there.
+    """
+    if not cv2.imwrite(str(path), image, options):
+        raise PerceptionError(f"cannot write {path}: check the folder, its permissions and the free space")
+
+
+def write_recording(folder: Path, frames: Iterable[Frame], notes: RecordingNotes) -> int:
+    """Write a recording's frames into a folder; returns how many.
+
+    Args:
+        folder: An empty or new folder.
+        frames: The frames, in order.
+        notes: Start of the action; the depth unit becomes `DEPTH_UNIT`.
+
+    Raises:
+        PerceptionError: An image cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rows: list[tuple[str, str, str]] = []
+    for number, frame in enumerate(frames):
+        names = [f"colour-{number:05d}.jpg", "" if frame.depth is None else f"depth-{number:05d}.png"]
+        write_image(folder / names[0], frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if frame.depth is not None:
+            steps = np.clip(np.rint(frame.depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+            write_image(folder / names[1], steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        rows.append((f"{frame.time:.6f}", names[0], names[1]))
+    with open(folder / TIMES, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([COLUMNS, *rows])
+    RecordingNotes(DEPTH_UNIT, notes.action_start).save(folder)
+    return len(rows)

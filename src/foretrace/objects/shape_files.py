@@ -1,0 +1,59 @@
+"""Objects and outlines from files: corners as text, meshes, descriptions, images of silhouettes."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from foretrace.errors import ShapeError
+from foretrace.files import read_json
+from foretrace.objects import MeshObject, ObjectModel, Prism, object_from_dict
+from foretrace.objects.prism import DEFAULT_HEIGHT
+
+
+def read_shape(path: Path, height: float | None = None) -> ObjectModel:
+    """An object from a description (``.json``, from ``to_dict``), a mesh (``.stl``, ``.obj``) or an outline (text).
+
+    Args:
+        path: The file.
+        height: Height of an outline's prism [m]; 0.02 by default.
+
+    Raises:
+        ShapeError: The file is missing, damaged, or describes no usable object.
+    """
+    if path.suffix.lower() in (".stl", ".obj"):
+        return MeshObject.load(path)
+    if path.suffix.lower() == ".json":
+        return object_from_dict(read_json(path, ShapeError, "give an object's to_dict() as JSON"))
+    return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)
+
+
+def read_polygon(file: Path) -> Float[np.ndarray, "n 2"]:
+    """Corners [m] from a text file with one "x y" or "x,y" per line; ``#`` starts a comment.
+
+    Raises:
+        ShapeError: The file is missing or is no such table.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+        corners = np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise ShapeError(
+            f'cannot read corners from {file} ({error}): write one "x y" per line [m]'
+        ) from error
+    if corners.ndim != 2 or corners.shape[1] != 2:
+        raise ShapeError(f'{file} has {corners.shape[-1]} numbers per line: write one "x y" per line [m]')
+    return corners
+
+
+def read_silhouette_image(file: Path) -> UInt8[np.ndarray, "rows columns"]:
+    """A silhouette's image in grey.
+
+    Raises:
+        ShapeError: The file cannot be read as an image.
+    """
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ShapeError(f"cannot read an image from {file}: give a PNG or JPEG, white object on black")
+    return image
