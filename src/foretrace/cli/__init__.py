@@ -1,8 +1,7 @@
 """The command line: ``foretrace simulate | train | predict | ...``.
 
-A command is a function of plain arguments in `COMMANDS`, or a `Group` of such; tyro makes the options from its
-signature and the help from its docstring. Whatever is slow to import is imported inside, so that
-``foretrace --help`` answers at once.
+A command is a function; `COMMANDS` has one line about each, and where it is. It is imported when it is asked for, so
+that ``foretrace --help`` answers at once; how its options come from its signature is in `foretrace.cli.parsing`.
 """
 
 import os
@@ -10,83 +9,60 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, Union
-
-import tyro
+from collections.abc import Sequence
 
 import foretrace
-from foretrace.cli.calibrate import calibrate
-from foretrace.cli.capture import capture
-from foretrace.cli.card import card
 from foretrace.cli.console import say
-from foretrace.cli.data import describe, doctor, show, simulate
-from foretrace.cli.demo import demo
-from foretrace.cli.evaluation import evaluate_paper, evaluate_predictor
-from foretrace.cli.export import export_lerobot, export_onnx, export_rerun, export_rosbag
-from foretrace.cli.figures import figures
-from foretrace.cli.film import film
-from foretrace.cli.learning import predict, train
-from foretrace.cli.non_flat import evaluate_non_flat
-from foretrace.cli.overlay import overlay
-from foretrace.cli.randomisation import evaluate_randomisation
-from foretrace.cli.reconstruction import evaluate_reconstruction
-from foretrace.cli.recordings import import_recording
-from foretrace.cli.replay import evaluate_replay
-from foretrace.cli.robot import robot
-from foretrace.cli.transfer import evaluate_transfer
-from foretrace.cli.uncertainty import evaluate_uncertainty
+from foretrace.cli.parsing import Command, Entry, Group, Ready, parse
 from foretrace.errors import ForetraceError
 
-Command = Callable[..., int | None]
+LEARN, SEE, HAND_ON = "simulate, learn, predict", "cameras and recordings", "other programs and robots"
+"""Headings of the list of commands."""
 
 
-@dataclass(frozen=True)
-class Group:
-    """Several commands under one name."""
-
-    summary: str
-    """What they have in common, in a line."""
-    commands: Mapping[str, Command]
-    """Each by its name within the group."""
+def _command(home: str, summary: str, section: str = "", varies: bool = False) -> Command:
+    return Command(summary, f"foretrace.cli.{home}", section, varies)
 
 
-COMMANDS: dict[str, Command | Group] = {
-    "demo": demo,
-    "simulate": simulate,
-    "train": train,
-    "evaluate": Group(
-        "Errors of one predictor, or the paper's comparisons of all of them.",
-        {
-            "predictor": evaluate_predictor,
-            "paper": evaluate_paper,
-            "randomisation": evaluate_randomisation,
-            "reconstruction": evaluate_reconstruction,
-            "replay": evaluate_replay,
-            "transfer": evaluate_transfer,
-            "non-flat": evaluate_non_flat,
-            "uncertainty": evaluate_uncertainty,
-        },
+EVALUATIONS: dict[str, Entry] = {
+    "predictor": _command("evaluation:evaluate_predictor", "Errors of one training."),
+    "paper": _command("evaluation:evaluate_paper", "The paper's comparisons and claims."),
+    "reconstruction": _command(
+        "reconstruction:evaluate_reconstruction", "What autoencoders retain of a mask."
     ),
-    "card": card,
-    "figures": figures,
-    "predict": predict,
-    "export": Group(
-        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot; predictors for ONNX.",
-        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot, "onnx": export_onnx},
+    "replay": _command("replay:evaluate_replay", "How far the simulation deviates from recorded motions."),
+    "transfer": _command("transfer:evaluate_transfer", "Errors on other physics, or on recordings."),
+    "non-flat": _command("non_flat:evaluate_non_flat", "What height maps add to masks."),
+    "randomisation": _command(
+        "randomisation:evaluate_randomisation", "What randomised data and known physics add."
     ),
-    "show": show,
-    "describe": describe,
-    "doctor": doctor,
-    "calibrate": calibrate,
-    "capture": capture,
-    "film": film,
-    "import": import_recording,
-    "overlay": overlay,
-    "robot": robot,
+    "uncertainty": _command(
+        "uncertainty:evaluate_uncertainty", "Whether probabilities and regions are calibrated."
+    ),
 }
-"""Every command by its name."""
+EXPORTS: dict[str, Entry] = {
+    "rosbag": _command("export:export_rosbag", "Interactions as bags of ROS 1 or ROS 2."),
+    "rerun": _command("export:export_rerun", "Interactions as Rerun recordings."),
+    "lerobot": _command("export:export_lerobot", "Interactions as one LeRobotDataset."),
+    "onnx": _command("export:export_onnx", "The network of a predictor as ONNX."),
+}
+COMMANDS: dict[str, Entry] = {
+    "demo": _command("demo:demo", "Simulate, train, predict and compare in a few minutes.", LEARN),
+    "simulate": _command("simulation:simulate", "Simulate lever-ups of many objects into a data set.", LEARN),
+    "data": _command("data:data", "Describe, check, repair or upgrade a data set.", LEARN),
+    "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
+    "evaluate": Group("Evaluate a predictor, or run an experiment.", EVALUATIONS, LEARN),
+    "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
+    "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
+    "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or write its calibration board.", SEE),
+    "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),
+    "film": _command("film:film", "Render a recording of a simulated lever-up.", SEE),
+    "capture": _command("capture:capture", "Record with a RealSense camera (experimental).", SEE),
+    "overlay": _command("overlay:overlay", "Draw prediction and observation over a recording.", SEE),
+    "export": Group("Write data for ROS, Rerun, LeRobot; predictors for ONNX.", EXPORTS, HAND_ON),
+    "robot": _command("robot:robot", "Check and execute a lever-up on a UR10 (experimental).", HAND_ON),
+}
+"""Every command by its name, in the order of the help."""
 
 
 INTERRUPTED = 130
@@ -98,7 +74,7 @@ OUTPUT_CLOSED = 141
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done. 1: `doctor` has something left to mend, or trainings of `evaluate paper` failed. 2: an error, printed as
+    0: done. 1: `data` has something left to mend, or a trial of `evaluate` failed. 2: an error, printed as
     one line. 130: interrupted. 141: the output was closed.
     """
     if threading.current_thread() is threading.main_thread():
@@ -121,6 +97,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise
 
 
+def read(arguments: Sequence[str]) -> Ready:
+    """The command that arguments ask for, ready to run.
+
+    Raises:
+        ForetraceError: There is no such command, or its options do not go together.
+        SystemExit: Help was asked for and has been printed; or the options cannot be read.
+    """
+    about = "Predict how an object will move before the robot touches it."
+    return parse(COMMANDS, arguments, "foretrace", about)
+
+
 def _run(arguments: Sequence[str]) -> int:
     """One command; its errors are told in one line."""
     if list(arguments) == ["--version"]:
@@ -129,12 +116,7 @@ def _run(arguments: Sequence[str]) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:
-            status = tyro.cli(
-                _choice(COMMANDS),
-                prog="foretrace",
-                description="Predict how an object will move before the robot touches it.",
-                args=arguments,
-            )
+            status = read(arguments)()
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -158,17 +140,3 @@ def _run(arguments: Sequence[str]) -> int:
 def _refuse(reason: str) -> int:
     say(f"error: {' '.join(reason.split())}")
     return 2
-
-
-def _choice(commands: Mapping[str, Command | Group]) -> Any:
-    """One of several commands, as a type that tyro understands."""
-    known = []
-    for name, command in commands.items():
-        if isinstance(command, Group):
-            nested = tyro.conf.subcommand(
-                name, constructor=_choice(command.commands), description=command.summary
-            )
-            known.append(Annotated[Any, nested])
-        else:
-            known.append(Annotated[Any, tyro.conf.subcommand(name, constructor=command)])
-    return Union[tuple(known)]  # noqa: UP007

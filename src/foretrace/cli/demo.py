@@ -33,8 +33,6 @@ def demo(
         workers: Processes that simulate; by default one for each core.
         seed: Seed of everything.
     """
-    from dataclasses import replace
-
     from foretrace.evaluation.metrics import evaluate_predictor
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import scene_animation

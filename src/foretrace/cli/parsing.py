@@ -5,14 +5,17 @@ from docstrings. What all commands have in common is decided here: how options l
 """
 
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
-from foretrace.errors import ForetraceError
+from foretrace.errors import CommandError
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo, StructTypeInfo
@@ -63,10 +66,6 @@ class Group:
 
 Entry = Command | Group | Callable[..., int | None]
 """A function, or one that is imported later, or several."""
-
-
-class CommandError(ForetraceError):
-    """There is no such command."""
 
 
 def without(fields: Mapping[type, Sequence[str]]) -> Callable[[T], T]:
@@ -120,7 +119,7 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
     return tyro.cli(
         command,  # pyright: ignore[reportArgumentType]
         prog=program,
-        description=_clean(documentation.split("\nArgs:\n")[0].strip()),
+        description=_wrap(_clean(documentation.split("\nArgs:\n")[0].strip())),
         args=list(words),
         registry=_registry(getattr(command, LEFT_OUT, {})),
         config=(
@@ -142,7 +141,7 @@ def _list(entries: Mapping[str, Entry], program: str, about: str, status: int) -
         if (heading := entry.section if named else "") != section:
             section = heading
             print(f"\n{section or 'commands'}:")
-        summary = entry.summary if named else (inspect.getdoc(entry) or "").partition("\n")[0]
+        summary = entry.summary if named else ""
         print(f"  {name:{width}}{summary}")
     print(f"\n`{program} COMMAND --help` lists the options of a command.")
     return status
@@ -211,12 +210,12 @@ def _take_apart(function: Callable[..., Any]) -> Any:
 
     hints = get_type_hints(function, include_extras=True)
     entries = docstring_parser.parse(inspect.getdoc(function) or "").params
-    help = {entry.arg_name: entry.description for entry in entries}
+    help = {entry.arg_name: " ".join((entry.description or "").split()) for entry in entries}
     fields = [
         StructFieldSpec(
             name,
             hints[name],
-            tyro.MISSING if parameter.default is parameter.empty else parameter.default,
+            tyro.MISSING_NONPROP if parameter.default is parameter.empty else parameter.default,
             help.get(name),
         )
         for name, parameter in inspect.signature(function).parameters.items()
@@ -235,5 +234,12 @@ def _help(text: str | Callable[[], str | None] | None) -> str | None:
 
 
 def _clean(text: str) -> str:
-    """Text without the marks that stand for code in docstrings."""
-    return text.replace("``", "")
+    """Text of a docstring for the terminal: without marks for code, and what is not given is no longer None."""
+    return re.sub(r"\bNone: ", "by default ", text.replace("``", ""))
+
+
+def _wrap(text: str) -> str:
+    """Paragraphs that fit the terminal; indented, since tyro joins lines that begin with a letter."""
+    width = min(get_terminal_size().columns, 120)
+    paragraphs = (" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+    return "\n".join(fill(each, width, initial_indent="  ", subsequent_indent="  ") for each in paragraphs)

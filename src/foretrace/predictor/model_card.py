@@ -14,8 +14,9 @@ from foretrace.imagined import LEVELS, STARTS, conformal_scores
 from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
-from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
+from foretrace.predictor import PREDICTORS, EffectPredictor, TrainConfig, load_predictor, part_of
 from foretrace.predictor.checkpoint import read_config
+from foretrace.predictor.config import feature_option
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
@@ -91,19 +92,21 @@ def _data(
 
 def _training(run: Path, data: Path) -> str:
     content = read_config(run)
-    training, config = content["training"], flatten({"feature_options": {}} | content["config"])
+    config_class, training = PREDICTORS.find(content["predictor"]).config_class, content["training"]
     command = [f"foretrace train --data {data} --out {run} --predictor {content['predictor']}"]
-    options = {name.removeprefix("feature_options."): value for name, value in config.items()}
+    options = dict(content["config"])
+    given = options.pop("feature_options", {})
+    options |= {feature_option(name, config_class): value for name, value in given.items()}
     options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
     for name, value in options.items():
         option = name.replace("_", "-")
-        if name in RUNTIME_OPTIONS or value is None or value == [] or value == {}:
+        if name in RUNTIME_OPTIONS or value is None or value == []:
             continue
-        if isinstance(value, bool):
-            command.append(f"--{'' if value else 'no-'}{option}")
-        else:
+        if not isinstance(value, bool):
             values = value if isinstance(value, list) else [value]
             command.append(f"--{option} {' '.join(map(str, values))}")
+        elif value != getattr(config_class, name, False):
+            command.append(f"--{'' if value else 'no-'}{option}")
     environment = read_json(run / ENVIRONMENT, TrainingError, "give the whole folder of a training")
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return (
