@@ -41,13 +41,12 @@ def imported(recorded: tuple[Path, RecordingTruth]) -> Imported:
     )
 
 
-def some_of(folder: Path, new: Path, **changes: object) -> Path:
-    """A copy of a recording without its images' names changed; ``frames`` keeps the first so many."""
+def some_of(folder: Path, new: Path, frames: int) -> Path:
+    """A copy of a recording that ends after some frames."""
     shutil.copytree(folder, new)
     rows = list(csv.reader((new / "timestamps.csv").read_text().splitlines()))
-    rows = rows[: 1 + int(str(changes.get("frames", 10)))]
     with open(new / "timestamps.csv", "w", newline="") as file:
-        csv.writer(file).writerows(rows)
+        csv.writer(file).writerows(rows[: 1 + frames])
     return new
 
 
@@ -120,8 +119,10 @@ def test_recordings_are_data_like_any_other(
         add_recorded(tmp_path / "simulated", imported.interaction, {})
 
 
-def test_an_unknown_object_is_taken_from_its_outline(recorded: tuple[Path, RecordingTruth]) -> None:
-    folder, truth = recorded
+def test_an_unknown_object_is_taken_from_its_outline(
+    recorded: tuple[Path, RecordingTruth], tmp_path: Path
+) -> None:
+    folder, truth = some_of(recorded[0], tmp_path / "some", frames=24), recorded[1]
     found = import_recording(
         open_recording(folder),
         CAMERA,
@@ -186,8 +187,7 @@ def test_why_no_marker_is_found(recorded: tuple[Path, RecordingTruth], tmp_path:
 
 def test_wrong_sides_and_gaps_are_noticed(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
     folder, _ = recorded
-    copy = tmp_path / "copy"
-    shutil.copytree(folder, copy)
+    copy = some_of(folder, tmp_path / "copy", frames=24)
     layout = json.loads((copy / "markers.json").read_text())
     layout["object"][0]["side"] *= 1.4
     (copy / "markers.json").write_text(json.dumps(layout))
@@ -223,7 +223,7 @@ def test_videos(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
 def test_depth_helps_where_the_background_does_not_tell(
     recorded: tuple[Path, RecordingTruth], tmp_path: Path
 ) -> None:
-    folder = shutil.copytree(recorded[0], tmp_path / "film")
+    folder = some_of(recorded[0], tmp_path / "film", frames=24)
     cv2.imwrite(str(folder / "background.png"), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
     layout, contact = MarkerLayout.load(folder / "markers.json"), Contact(edge=(2, 0.5))
     with pytest.warns(UserWarning, match="found by depth, since by background: .* of the image differ"):

@@ -54,7 +54,7 @@ CONFIGURATIONS: dict[RosVersion, str] = {1: "ros1.rviz", 2: "ros2.rviz"}
 
 
 @dataclass(frozen=True)
-class Said:
+class Stamped:
     """A message, and when and where it is sent."""
 
     stamp: int
@@ -84,15 +84,15 @@ def export_rosbags(
         for episode in watched(episodes, "bags"):
             path = folder / f"interaction-{episode.interaction.id:06d}"
             if version == 1:
-                _write_ros1(path.with_suffix(".bag"), make, said(episode, make, camera))
+                _write_ros1(path.with_suffix(".bag"), make, stamped_messages(episode, make, camera))
             else:
-                _write_ros2(path, make, said(episode, make, camera))
+                _write_ros2(path, make, stamped_messages(episode, make, camera))
         name = CONFIGURATIONS[version]
         configuration = importlib.resources.files("foretrace.export") / "rviz" / name
         (folder / "foretrace.rviz").write_bytes(configuration.read_bytes())
 
 
-def said(episode: Episode, make: Messages, camera: bool) -> list[Said]:
+def stamped_messages(episode: Episode, make: Messages, camera: bool) -> list[Stamped]:
     """Everything that a bag holds, in the order of time."""
     interaction = episode.interaction
     seen = None
@@ -114,40 +114,40 @@ def stamps_of(times: Float[np.ndarray, " time"]) -> list[int]:
     return [round((START + float(time)) * 1e9) for time in times]
 
 
-def _at_rest(episode: Episode, make: Messages, seen: RenderedImages | None) -> Iterator[Said]:
+def _at_rest(episode: Episode, make: Messages, seen: RenderedImages | None) -> Iterator[Stamped]:
     """What is known before the blade moves: the view from above, the imagined path, where the camera is."""
     interaction, first = episode.interaction, stamps_of(episode.interaction.effect.times)[0]
-    yield Said(first, "/view/height", make.image(first, ACTION, interaction.view.height))
+    yield Stamped(first, "/view/height", make.image(first, ACTION, interaction.view.height))
     if episode.imagined is not None:
         poses = _with_rotation(episode.imagined.com_trajectory, episode.imagined_pose)
         path = make.path(stamps_of(episode.imagined.times), ACTION, poses)
         path.header.stamp = make.header(first, ACTION).stamp
-        yield Said(first, "/imagined/path", path)
+        yield Stamped(first, "/imagined/path", path)
     if seen is not None:
         there = make.transform(first, ACTION, CAMERA, matrix_to_pose(seen.T_action_camera))
-        yield Said(first, "/tf_static", make.make(TRANSFORMS, transforms=[there]))
+        yield Stamped(first, "/tf_static", make.make(TRANSFORMS, transforms=[there]))
 
 
-def _moving_frames(episode: Episode, make: Messages) -> Iterator[Said]:
+def _moving_frames(episode: Episode, make: Messages) -> Iterator[Stamped]:
     effect, ghost = episode.interaction.effect, episode.imagined_pose
     for k, stamp in enumerate(stamps_of(effect.times)):
         moving = {THING: effect.pose_trajectory[k], TOOL: effect.tool_trajectory[k]}
         if ghost is not None:
             moving[GHOST] = ghost[_nearest(episode, k)]
         frames = [make.transform(stamp, ACTION, child, pose) for child, pose in moving.items()]
-        yield Said(stamp, "/tf", make.make(TRANSFORMS, transforms=frames))
+        yield Stamped(stamp, "/tf", make.make(TRANSFORMS, transforms=frames))
 
 
-def _observed_paths(episode: Episode, make: Messages) -> Iterator[Said]:
+def _observed_paths(episode: Episode, make: Messages) -> Iterator[Stamped]:
     effect = episode.interaction.effect
     stamps = stamps_of(effect.times)
     poses = _with_rotation(effect.com_trajectory, effect.pose_trajectory)
     ends = np.unique(np.linspace(1, len(stamps), min(len(stamps), MOST_PATHS)).round().astype(int))
     for end in ends:
-        yield Said(stamps[end - 1], "/observed/path", make.path(stamps[:end], ACTION, poses[:end]))
+        yield Stamped(stamps[end - 1], "/observed/path", make.path(stamps[:end], ACTION, poses[:end]))
 
 
-def _markers(episode: Episode, make: Messages) -> Iterator[Said]:
+def _markers(episode: Episode, make: Messages) -> Iterator[Stamped]:
     effect, last = episode.interaction.effect, -np.inf
     for k, stamp in enumerate(stamps_of(effect.times)):
         dots = [
@@ -159,7 +159,7 @@ def _markers(episode: Episode, make: Messages) -> Iterator[Said]:
         if effect.times[k] - last >= MARKER_PERIOD:
             last = effect.times[k]
             dots += _bodies(episode, make, stamp)
-        yield Said(stamp, "/markers", make.make(TOPICS["/markers"], markers=dots))
+        yield Stamped(stamp, "/markers", make.make(TOPICS["/markers"], markers=dots))
 
 
 def _bodies(episode: Episode, make: Messages, stamp: int) -> Iterator[Any]:
@@ -172,14 +172,16 @@ def _bodies(episode: Episode, make: Messages, stamp: int) -> Iterator[Any]:
         yield make.solid(stamp, TOOL, "tool", id, part.shape, part.centre, part.size, part.colour)
 
 
-def _images(times: Float[np.ndarray, " time"], make: Messages, seen: RenderedImages | None) -> Iterator[Said]:
+def _images(
+    times: Float[np.ndarray, " time"], make: Messages, seen: RenderedImages | None
+) -> Iterator[Stamped]:
     if seen is None:
         return
     for k, stamp in enumerate(stamps_of(times)):
         info = make.camera_info(stamp, CAMERA, seen.camera)
         for stream, pixels in (("color/image_raw", seen.rgb[k]), ("depth/image_rect_raw", seen.depth[k])):
-            yield Said(stamp, f"/camera/{stream}", make.image(stamp, CAMERA, pixels))
-            yield Said(stamp, f"/camera/{stream.split('/')[0]}/camera_info", info)
+            yield Stamped(stamp, f"/camera/{stream}", make.image(stamp, CAMERA, pixels))
+            yield Stamped(stamp, f"/camera/{stream.split('/')[0]}/camera_info", info)
 
 
 def _nearest(episode: Episode, k: int) -> int:
@@ -196,7 +198,7 @@ def _with_rotation(
     return np.concatenate([com, still if pose is None else pose[:, 3:]], axis=1)
 
 
-def _write_ros1(path: Path, make: Messages, messages: Sequence[Said]) -> None:
+def _write_ros1(path: Path, make: Messages, messages: Sequence[Stamped]) -> None:
     # Not compressed: ROS 1 cannot read the frames of lz4 that rosbags writes, and bz2 takes half a minute for a bag.
     with rosbag1.Writer(path) as writer:
         topics = {}
@@ -210,7 +212,7 @@ def _write_ros1(path: Path, make: Messages, messages: Sequence[Said]) -> None:
             writer.write(topics[each.topic], each.stamp, data)
 
 
-def _write_ros2(path: Path, make: Messages, messages: Sequence[Said]) -> None:
+def _write_ros2(path: Path, make: Messages, messages: Sequence[Stamped]) -> None:
     # Version 8 of the metadata is the newest that does without the profiles' new layout.
     writer = rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin.MCAP)
     writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
@@ -227,9 +229,9 @@ def _write_ros2(path: Path, make: Messages, messages: Sequence[Said]) -> None:
             writer.write(topics[each.topic], each.stamp, data)
 
 
-def _topics(messages: Sequence[Said]) -> list[str]:
-    said_on = {each.topic for each in messages}
-    return [topic for topic in TOPICS if topic in said_on]
+def _topics(messages: Sequence[Stamped]) -> list[str]:
+    used = {each.topic for each in messages}
+    return [topic for topic in TOPICS if topic in used]
 
 
 def _kept() -> Qos:

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,7 +83,9 @@ def _chosen(path: Path, asked: str | None, topics: list[str], kind: str, option:
     return asked
 
 
-def _reader(path: Path) -> Any:
+@contextmanager
+def _reader(path: Path) -> Iterator[Any]:
+    """An open reader of a bag."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -97,25 +100,12 @@ def _reader(path: Path) -> Any:
                 "`ros2 bag reindex`"
             )
     try:
-        return _Opened(AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)), path)
+        reader = AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
     except Exception as error:  # every kind of damage has an exception of its own there
         raise _damaged(path, error) from error
-
-
-class _Opened:
-    """A reader whose errors name the bag."""
-
-    def __init__(self, reader: Any, path: Path):
-        self._reader, self._path = reader, path
-
-    def __enter__(self) -> Any:
-        try:
-            return self._reader.__enter__()
-        except Exception as error:
-            raise _damaged(self._path, error) from error
-
-    def __exit__(self, *exception: Any) -> None:
-        self._reader.__exit__(*exception)
+    with closing(reader):
+        yield reader
 
 
 def _damaged(path: Path, error: Exception) -> PerceptionError:

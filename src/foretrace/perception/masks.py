@@ -1,6 +1,5 @@
 """Where the object is in an image: by what changed, brightness, colour or GrabCut; by height in a depth image."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -262,20 +261,13 @@ def pick_object(
     return found
 
 
-@dataclass(frozen=True)
-class TablePlane:
-    """The table in a depth image."""
+def find_table(
+    depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, seed: int = 0
+) -> Float[np.ndarray, "4 4"]:
+    """T_table_camera over the plane that most points of a depth image lie on.
 
-    T_table_camera: Float[np.ndarray, "4 4"]
-    """The camera over the table: z out of the table, origin below the camera, x along the image's columns."""
-    share: float
-    """Share of the points that lie on it."""
-    deviation: float
-    """Standard deviation of those points from it [m]."""
-
-
-def find_table(depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, seed: int = 0) -> TablePlane:
-    """The plane that most points of a depth image lie on (RANSAC: Fischler and Bolles, 1981), then least squares.
+    By RANSAC (Fischler and Bolles, 1981), then least squares. The table frame has z out of the table, its origin below
+    the camera, and x along the image's columns.
 
     Raises:
         PerceptionError: The image holds no depth, is another camera's, or shows no table.
@@ -312,9 +304,7 @@ def find_table(depth: Float[np.ndarray, "rows columns"], camera: PinholeCamera, 
     T[:3, 0], T[:3, 2] = along / np.linalg.norm(along), normal
     T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
     T[:3, 3] = normal * (middle @ normal)
-    return TablePlane(
-        invert_transform(T), float(inside.mean()), float(((points[inside] - middle) @ normal).std())
-    )
+    return invert_transform(T)
 
 
 def _fit_plane(points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

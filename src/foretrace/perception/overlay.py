@@ -50,28 +50,14 @@ def draw_overlay(
     for name, radius in (radii or {}).items():
         path, colour = (paths or {})[name]
         _tube(drawn, camera, transform_points(T_camera_frame, path), radius, colour)
+    scale, font = camera.width / 1280, cv2.FONT_HERSHEY_SIMPLEX
     for row, (name, (path, colour)) in enumerate((paths or {}).items()):
         # Each path thinner than the one before, so that none hides another.
-        _line(
-            drawn,
-            camera.project(path, T_camera_frame),
-            colour,
-            max(2, 4 * width - 3 * width * row),
-            closed=False,
-        )
-        scale = camera.width / 1280
+        thin = max(2, 4 * width - 3 * width * row)
+        _line(drawn, camera.project(path, T_camera_frame), colour, thin, closed=False)
         place = (round(24 * scale), round((40 + 38 * row) * scale))
-        for thick, ink in ((5, (255, 255, 255)), (2, colour)):
-            cv2.putText(
-                drawn,
-                name,
-                place,
-                cv2.FONT_HERSHEY_SIMPLEX,
-                scale,
-                ink,
-                max(1, round(thick * scale)),
-                cv2.LINE_AA,
-            )
+        for thick, ink in ((max(1, round(5 * scale)), OUTLINE), (max(1, round(2 * scale)), colour)):
+            cv2.putText(drawn, name, place, font, scale, ink, thick, cv2.LINE_AA)
     return drawn
 
 

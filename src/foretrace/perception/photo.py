@@ -164,7 +164,7 @@ def locate_camera(
 ) -> Float[np.ndarray, "4 4"]:
     """T_table_camera by the table's markers; by the table in the depth image where none are found.
 
-    Without markers the table frame has its origin below the camera and x along the image's columns.
+    Without markers the table frame is that of `masks.find_table`.
 
     Raises:
         PerceptionError: Neither markers nor depth show the table.
@@ -179,7 +179,7 @@ def locate_camera(
             warnings.warn(f"the table is found by depth, since by markers: {error}", stacklevel=2)
     if depth is None:
         raise PerceptionError("neither a marker layout nor a depth image shows the table: give one of them")
-    return masks.find_table(depth, camera).T_table_camera
+    return masks.find_table(depth, camera)
 
 
 def _find(

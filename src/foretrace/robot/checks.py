@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -107,28 +108,26 @@ def check_path(
     flanges, wrists = np.array([p.flange for p in postures]), np.array([p.wrist for p in postures])
     ahead = wrists[:, 0] * np.cos(path.joints[:, 0]) + wrists[:, 1] * np.sin(path.joints[:, 0])
     smallest = [float(np.linalg.svd(p.jacobian, compute_uv=False)[-1]) for p in postures]
-    worst = _Worst(path)
+    most, least = partial(_worst, path), partial(_worst, path, at_least=True)
     return [
-        worst.highest("joint angle", "rad", np.abs(path.joints), arm.JOINT_LIMIT - limits.joint_margin),
-        worst.highest("joint speed", "rad/s", np.abs(steps), np.array(limits.joint_speed)),
-        worst.highest("joint acceleration", "rad/s2", np.abs(changes), limits.joint_acceleration),
-        worst.highest("blade tip speed", "m/s", tip_steps, limits.tip_speed),
-        worst.lowest("arm above table", "m", np.array(links), limits.clearance),
-        worst.lowest("blade above table", "m", np.array(blade), limits.blade_clearance),
-        worst.lowest("flange from base axis", "m", np.hypot(*flanges[:, :2].T), limits.nearest),
-        worst.highest("flange from base", "m", np.linalg.norm(flanges, axis=1), limits.farthest),
-        worst.lowest("elbow singularity", "sine", np.abs(np.sin(path.joints[:, 2])), limits.elbow),
-        worst.lowest("wrist singularity", "sine", np.abs(np.sin(path.joints[:, 4])), limits.wrist),
-        worst.lowest("shoulder singularity", "m", np.abs(ahead), limits.shoulder),
-        worst.lowest("least singular value", "", np.array(smallest), limits.singular_value),
+        most("joint angle", "rad", np.abs(path.joints), arm.JOINT_LIMIT - limits.joint_margin),
+        most("joint speed", "rad/s", np.abs(steps), np.array(limits.joint_speed)),
+        most("joint acceleration", "rad/s2", np.abs(changes), limits.joint_acceleration),
+        most("blade tip speed", "m/s", tip_steps, limits.tip_speed),
+        least("arm above table", "m", np.array(links), limits.clearance),
+        least("blade above table", "m", np.array(blade), limits.blade_clearance),
+        least("flange from base axis", "m", np.hypot(*flanges[:, :2].T), limits.nearest),
+        most("flange from base", "m", np.linalg.norm(flanges, axis=1), limits.farthest),
+        least("elbow singularity", "sine", np.abs(np.sin(path.joints[:, 2])), limits.elbow),
+        least("wrist singularity", "sine", np.abs(np.sin(path.joints[:, 4])), limits.wrist),
+        least("shoulder singularity", "m", np.abs(ahead), limits.shoulder),
+        least("least singular value", "", np.array(smallest), limits.singular_value),
     ]
 
 
 def check_start(path: ArmPath, limits: ArmLimits) -> Check:
     """How far the arm has to turn on its way to the start."""
-    return _Worst(path).highest(
-        "way to the start", "rad", np.abs(path.joints - path.joints[-1]), limits.reposition
-    )
+    return _worst(path, "way to the start", "rad", np.abs(path.joints - path.joints[-1]), limits.reposition)
 
 
 def refuse_unsafe(checks: list[Check]) -> None:
@@ -147,37 +146,22 @@ def refuse_unsafe(checks: list[Check]) -> None:
             )
 
 
-class _Worst:
-    """Finds worst moments of a leg."""
-
-    def __init__(self, path: ArmPath) -> None:
-        self._path = path
-
-    def highest(self, name: str, unit: str, values: np.ndarray, limit: float | np.ndarray) -> Check:
-        """Values (time,) or (time, 6) that must not exceed their limit."""
-        return self._check(name, unit, values, limit, at_least=False)
-
-    def lowest(self, name: str, unit: str, values: np.ndarray, limit: float) -> Check:
-        """Values (time,) that must not fall below their limit."""
-        return self._check(name, unit, values, limit, at_least=True)
-
-    def _check(
-        self, name: str, unit: str, values: np.ndarray, limit: float | np.ndarray, at_least: bool
-    ) -> Check:
-        limits = np.broadcast_to(limit, values.shape)
-        # A leg of one set point has no speed.
-        if values.size == 0:
-            return Check(self._path.name, name, unit, 0.0, float(np.min(limit)), at_least, 0, 0.0, None)
-        excess = limits - values if at_least else values - limits
-        where = np.unravel_index(int(excess.argmax()), values.shape)
-        return Check(
-            leg=self._path.name,
-            name=name,
-            unit=unit,
-            value=float(values[where]),
-            limit=float(limits[where]),
-            at_least=at_least,
-            sample=int(where[0]),
-            time=float(self._path.times[where[0]]),
-            joint=arm.JOINT_NAMES[where[1]] if len(where) > 1 else None,
-        )
+def _worst(
+    path: ArmPath,
+    name: str,
+    unit: str,
+    values: np.ndarray,
+    limit: float | np.ndarray,
+    *,
+    at_least: bool = False,
+) -> Check:
+    """Worst moment of values (time,) or (time, joint), which must keep a largest or a least value."""
+    limits = np.broadcast_to(limit, values.shape)
+    if values.size == 0:  # a leg of one set point has no speed
+        return Check(path.name, name, unit, 0.0, float(np.min(limit)), at_least, 0, 0.0, None)
+    excess = limits - values if at_least else values - limits
+    where = np.unravel_index(int(excess.argmax()), values.shape)
+    value, bound = float(values[where]), float(limits[where])
+    sample, time = int(where[0]), float(path.times[where[0]])
+    joint = arm.JOINT_NAMES[where[1]] if len(where) > 1 else None
+    return Check(path.name, name, unit, value, bound, at_least, sample, time, joint)

@@ -17,7 +17,13 @@ from jaxtyping import Float, UInt8
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
 from foretrace.files import write_json
-from foretrace.geometry import invert_transform, matrix_to_pose, planar_transform, pose_to_matrix
+from foretrace.geometry import (
+    invert_transform,
+    matrix_to_pose,
+    planar_transform,
+    pose_to_matrix,
+    transform_points,
+)
 from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
@@ -267,9 +273,7 @@ def marker_spot(
     middle, rim = np.array(circle.coords)
     half_diagonal = np.linalg.norm(rim - middle)
     side = min(largest, float(half_diagonal) * np.sqrt(2) * MODULES / (MODULES + 2))
-    angle = rng.uniform(-np.pi, np.pi)
-    pose = np.array([*middle, obj.height + SLAB, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
-    return pose_to_matrix(pose), side
+    return planar_transform([*middle, obj.height + SLAB], rng.uniform(-np.pi, np.pi)), side
 
 
 def marker_image(id: int) -> UInt8[np.ndarray, "rows columns"]:
@@ -311,23 +315,13 @@ def _add_markers(
 def _layout(T_table_action: Float[np.ndarray, "4 4"], side: float, config: RecordingConfig) -> dict[str, Any]:
     """The marker layout, as measured with a ruler."""
     spots = np.column_stack([TABLE_SPOTS, np.zeros(len(TABLE_SPOTS))])
-    in_table = spots @ T_table_action[:3, :3].T + T_table_action[:3, 3]
+    in_table = transform_points(T_table_action, spots)[:, :2].round(6)
     table = [
-        {
-            "id": id,
-            "side": config.table_side,
-            "position": [round(float(v), 6) for v in spot[:2]],
-            "angle_deg": 0.0,
-        }
-        for id, spot in enumerate(in_table)
+        {"id": id, "side": config.table_side, "position": spot, "angle_deg": 0.0}
+        for id, spot in enumerate(in_table.tolist())
     ]
-    return {
-        "format": "foretrace-markers",
-        "version": 1,
-        "dictionary": DICTIONARY,
-        "table": table,
-        "object": [{"id": OBJECT_ID, "side": side}],
-    }
+    layout = {"format": "foretrace-markers", "version": 1, "dictionary": DICTIONARY}
+    return layout | {"table": table, "object": [{"id": OBJECT_ID, "side": side}]}
 
 
 def _interpolate(motion: Motion, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
