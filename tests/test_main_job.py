@@ -5,6 +5,7 @@ import subprocess
 import sys
 import venv
 import zipfile
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -16,9 +17,13 @@ from PIL import Image
 
 from foretrace import cli
 from foretrace.evaluation.metrics import at_times
+from foretrace.pictures import animation
 from foretrace.predictor import ImaginedBatch
 
 ROOT = Path(__file__).parents[1]
+SMALL_TRAINING = (
+    "train --features im-cnn --epochs 2 --min-steps 1 --hidden 8 --device cpu --threads 1".split()
+)
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +37,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(data: Path) -> Path:
     out = data.parent / "run"
-    command = ["train", "--data", str(data), "--out", str(out), "--epochs", "2", "--device", "cpu"]
-    assert cli.main([*command, "--threads", "1"]) == 0
+    assert cli.main([*SMALL_TRAINING, "--data", str(data), "--out", str(out)]) == 0
     return out
 
 
@@ -90,7 +94,7 @@ def test_imagined_paths_are_compared_at_the_times_of_the_data() -> None:
 
 def test_describe_writes_figures(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "figures.json"
-    assert cli.main(["describe", str(data), "--out", str(out)]) == 0
+    assert cli.main(["data", str(data), "--out", str(out)]) == 0
     figures = json.loads(out.read_text())
     assert figures["interactions"] == sum(figures["outcomes"].values()) == 52
     assert 20 < figures["median_final_tilt_deg"] < 80
@@ -152,7 +156,7 @@ def test_wrong_input_is_one_clear_line(
         "Self-intersection": ["predict", str(run), "--polygon", str(crossed), "--edge", "0"],
         "cannot read corners": ["predict", str(run), "--polygon", str(tmp_path / "none.txt"), "--edge", "0"],
         "needs --scale": ["predict", str(run), "--image", str(polygon), "--edge", "0"],
-        "cannot read a picture": [
+        "cannot read an image": [
             "predict",
             str(run),
             "--image",
@@ -162,7 +166,7 @@ def test_wrong_input_is_one_clear_line(
             "--edge",
             "0",
         ],
-        "--seed is -1": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--seed", "-1"],
+        "seed is -1": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--seed", "-1"],
         "threads is 0": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--threads", "0"],
         "density = 1e-30": ["predict", *shape, "--edge", "0", "--compare", "--density", "1e-30"],
         "--seconds is nan": ["capture", str(tmp_path / "film"), "--seconds", "nan"],
@@ -176,16 +180,20 @@ def test_wrong_input_is_one_clear_line(
 
 def test_a_finished_training_is_not_repeated(run: Path, data: Path) -> None:
     before = (run / "model.safetensors").read_bytes()
-    command = ["train", "--data", str(data), "--out", str(run), "--epochs", "2", "--device", "cpu"]
-    assert cli.main(command) == 0
+    assert cli.main([*SMALL_TRAINING, "--data", str(data), "--out", str(run)]) == 0
     assert (run / "model.safetensors").read_bytes() == before
 
 
-@pytest.mark.slow
-def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert (
-        cli.main(["demo", "--out", str(tmp_path), "--objects", "8", "--epochs", "1", "--workers", "1"]) == 0
-    )
+def test_a_card_is_written_for_a_finished_training(run: Path, data: Path) -> None:
+    assert cli.main([*SMALL_TRAINING, "--data", str(data), "--out", str(run), "--card"]) == 0
+    assert (run / "MODEL_CARD.md").read_text().startswith("# Model card: lstm predictor")
+
+
+def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    every_frame = animation.frames
+    monkeypatch.setattr(animation, "frames", lambda scene: islice(every_frame(scene), 2))
+    small = ["--objects", "8", "--contacts-per-edge", "1", "--epochs", "1", "--min-steps", "1"]
+    assert cli.main(["demo", "--out", str(tmp_path), "--workers", "1", *small]) == 0
     printed = capsys.readouterr().out
     for name in ("interactions.png", "predictions.png", "prediction.gif"):
         assert (tmp_path / name).stat().st_size > 10_000
@@ -217,6 +225,8 @@ def test_the_built_wheel_holds_everything(tmp_path: Path) -> None:
         )
         program = program.replace("print(ft.simulate", f"{shipped}print(ft.simulate")
     python = environment / "bin" / "python"
-    done = subprocess.run([python, "-c", program], check=True, capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [python, "-I", "-c", program], check=True, capture_output=True, text=True, cwd=tmp_path
+    )
     assert str(packages) in done.stdout
     assert done.stdout.splitlines()[-1] in ("levered", "slipped")

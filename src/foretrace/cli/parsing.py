@@ -148,7 +148,7 @@ def _list(entries: Mapping[str, Entry], program: str, about: str, status: int) -
 
 
 def _suggest(name: str, entries: Mapping[str, Entry]) -> str:
-    if close := get_close_matches(name, entries, n=1):
+    if close := get_close_matches(name, entries, n=1, cutoff=0.75):
         return f"did you mean {close[0]}?"
     return f"choose from {', '.join(entries)}"
 
