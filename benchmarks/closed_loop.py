@@ -244,7 +244,7 @@ def measure(folder: Path, camera: PinholeCamera, predictor, picture: Path | None
         },
         "start_error_s": found.start - truth["action_start"],
     }
-    imagined = predictor.imagine(exact, com_in_action)
+    imagined = predictor.imagine(exact, com=com_in_action)
     grid = imagined.times[imagined.times <= times[-1]]
     path = np.column_stack([np.interp(grid, times, moved[:, i]) for i in range(3)])
     slip = found.interaction.effect.slip_index
@@ -252,7 +252,7 @@ def measure(folder: Path, camera: PinholeCamera, predictor, picture: Path | None
     result["error_exact_cm"] = 100 * float(mean_distance(imagined.com_trajectory[:end], path[:end]))
     for how in ("background", "depth"):
         sight = sight_of(folder, found.T_table_camera, camera, (float(column), float(row)), how)
-        seen = predictor.imagine(sight.view, sight.com_in_action)
+        seen = predictor.imagine(sight.view, com=sight.com_in_action)
         # In the table frame: an action frame that was seen askew counts as an error of the prediction.
         in_table = transform_points(sight.T_table_action, seen.com_trajectory)
         in_action = transform_points(T_action_table, in_table)

@@ -32,19 +32,17 @@ def seconds(work: Callable[[], object], repeats: int = 1) -> float:
     return (time.process_time() - start) / repeats
 
 
-def all_futures(predictor: OneShotPredictor, view: TopDownView, known: dict[str, float]) -> np.ndarray:
-    """Whole motions of all futures, the poses included that are worked out when somebody asks."""
-    futures = predictor.imagine(view, known=known).futures
-    assert futures is not None
-    return futures.pose
+def all_futures(predictor: OneShotPredictor, view: TopDownView, context: dict[str, float]) -> np.ndarray:
+    """Whole motions of all futures, including the poses, which are computed on demand."""
+    return predictor.imagine(view, context=context).futures.pose
 
 
-def contacts_of(prism: Prism, first: LeverUp, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Contact points around a prism and directions there, in the action frame of its first lever-up."""
+def candidates_of(prism: Prism, first: LeverUp, rng: np.random.Generator) -> list[LeverUp]:
+    """Lever-ups around a prism, in the action frame of its first one."""
     per_edge = -(-CONTACTS // len(prism.corners))
     actions = sample_contacts(prism, rng, per_edge=per_edge)[:CONTACTS]
     frames = [first.T_action_object @ np.linalg.inv(action.T_action_object) for action in actions]
-    return np.array([frame[:2, 3] for frame in frames]), np.array([frame[:2, 0] for frame in frames])
+    return [LeverUp(frame[:2, 3], frame[:2, 0]) for frame in frames]
 
 
 def main() -> None:
@@ -63,10 +61,10 @@ def main() -> None:
         prism = sample_prism(rng, 3 + k % 8)
         actions = sample_contacts(prism, rng, per_edge=2)
         view = TopDownView.of(prism, actions[0])
-        contacts, directions = contacts_of(prism, actions[0], rng)
-        known = dict.fromkeys(predictor.known, 0.5)
-        one = seconds(lambda: all_futures(predictor, view, known), 20)  # noqa: B023
-        many = seconds(lambda: predictor.imagine_contacts(view, contacts, directions, known=known), 2)  # noqa: B023
+        candidates = candidates_of(prism, actions[0], rng)
+        context = dict.fromkeys(predictor.context, 0.5)
+        one = seconds(lambda: all_futures(predictor, view, context), 20)  # noqa: B023
+        many = seconds(lambda: predictor.imagine_candidates(view, candidates, context=context), 2)  # noqa: B023
         simulated = [
             seconds(lambda: simulate_lever_up(prism, action, SimulationConfig(embodiment="tool")))  # noqa: B023
             for action in actions[:SIMULATED]

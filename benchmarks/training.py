@@ -12,6 +12,7 @@ that suit the hardware. Both see the same windows in one epoch. Every core train
 import argparse
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 
 import torch
@@ -76,7 +77,7 @@ def plain_step(label: str, config: LstmConfig) -> Callable[[], None]:
 
 
 def shipped_step(label: str, config: LstmConfig) -> Callable[[], None]:
-    predictor = LstmPredictor(make_features(label), NUM_SAMPLES, config).train()
+    predictor = LstmPredictor(replace(config, features=label), NUM_SAMPLES).train()
     predictor.set_precision(fast_precision(torch.device("cpu")))
     optimizer = torch.optim.AdamW([p for p in predictor.parameters() if p.requires_grad], fused=True)
     inputs = views() if label == "im-cnn" else torch.randn(BATCH, predictor.features.num_features)

@@ -115,7 +115,10 @@ def test_other_formats_are_refused(saved):
     [
         ({"predictor": "oracle"}, "unknown predictor 'oracle'; available: lstm"),
         ({"predictor": ["lstm"]}, "unknown predictor"),
-        ({"config": {"hidden": 8}}, "missing or unknown settings context, feature_options, features, residual"),
+        (
+            {"config": {"hidden": 8}},
+            "missing or unknown settings context, feature_options, features, residual",
+        ),
         ({"config": None}, "incomplete"),
         ({"num_samples": "ten"}, "incomplete"),
         ({"outcomes": ["melted"]}, "unknown outcome 'melted'"),
@@ -148,7 +151,10 @@ def test_misshaped_tensors_are_named(saved, wrong):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"features": "magic"}, "unknown features 'magic'"), ({"hidden": -1}, "hidden is -1: give a number from 1")],
+    [
+        ({"features": "magic"}, "unknown features 'magic'"),
+        ({"hidden": -1}, "hidden is -1: give a number from 1"),
+    ],
 )
 def test_odd_settings_are_refused(saved, change, message):
     config = json.loads((saved / "config.json").read_text())["config"]

@@ -9,18 +9,15 @@ import torch
 from factories import fake_batch
 from foretrace.actions import LeverUp
 from foretrace.errors import CheckpointError, PredictionError
-from foretrace.features import make_features
+from foretrace.imagined import Scenes, estimate_com
+from foretrace.imagined.domain import check_view, find_unusual, measure, ranges_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Box, sample_prism
-from foretrace.predictor import LstmPredictor, TrainConfig, load_predictor, train_predictor
-from foretrace.predictor.base import estimate_com
-from foretrace.predictor.domain import check_view, find_unusual, measure, ranges_of
+from foretrace.predictor import LstmConfig, OneShotConfig, TrainConfig, load_predictor, train_predictor
 
-QUICK = TrainConfig(
-    predictor="one-shot", features="outline", hidden=8, epochs=1, min_steps=1, split=None, learning_rate=4e-3,
-    outcomes=("levered", "slipped"),
-)  # fmt: skip
+CONFIG = OneShotConfig(hidden=8, outcomes=("levered", "slipped"))
+QUICK = TrainConfig(epochs=1, min_steps=1, split=None, learning_rate=4e-3)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -37,7 +34,7 @@ def view() -> TopDownView:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     batch = fake_batch(np.random.default_rng(0), 24, num_samples=24)
-    return train_predictor(batch, QUICK, tmp_path_factory.mktemp("domain") / "run", progress=False)
+    return train_predictor(batch, CONFIG, tmp_path_factory.mktemp("domain") / "run", QUICK, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -100,18 +97,18 @@ def test_small_spots_and_inexact_contacts_are_fine(view):
 
 
 def test_every_predictor_refuses_nonsense(view):
-    predictor = LstmPredictor(make_features("none"), 4).eval()
+    predictor = LstmConfig(features="none").make(4).eval()
     predictor.imagine(view)
     with pytest.raises(PredictionError, match="2 objects"):
         predictor.imagine(NONSENSE["shows 2 objects"](view))
     with pytest.raises(PredictionError, match="give a finite centre of mass"):
-        predictor.imagine(view, np.array([0.0, np.nan, 0.0]))
+        predictor.imagine(view, com=[0.0, np.nan, 0.0])
 
 
 def test_measures_are_those_of_the_object(view):
     batch = InteractionBatch.from_views([view])
-    measures = measure(batch, np.array([[0.03, 0.04, 0.015]]), np.array([4]))
-    box = {"area": 0.008, "length": 0.08, "width": 0.1, "height": 0.03, "distance": 0.05, "corners": 4}
+    measures = measure(batch, np.array([[0.03, 0.04, 0.015]]))
+    box = {"area": 0.008, "length": 0.08, "width": 0.1, "height": 0.03, "distance": 0.05}
     for name, value in box.items():
         assert measures[name][0] == pytest.approx(value, rel=0.05)
 
@@ -146,7 +143,7 @@ def test_ranges_are_the_training_parts_and_kept(run):
     assert 3 <= ranges["corners"][0] < ranges["corners"][1] <= 11
     # The same training again is the same training; and whole already.
     before = (run / "config.json").read_text()
-    train_predictor(batch, QUICK, run, progress=False)
+    train_predictor(batch, CONFIG, run, QUICK, progress=False)
     assert (run / "config.json").read_text() == before
 
 
@@ -182,6 +179,7 @@ def test_looking_takes_no_time(run, view):
     for _ in range(30):
         started = perf_counter()
         check_view(view)
-        find_unusual(predictor.measure(batch, com, inputs), predictor.ranges)
+        scenes = Scenes(batch, com, np.zeros((1, 0)))
+        find_unusual(scenes.measure() | predictor.features.measure(inputs), predictor.ranges)
         seconds.append(perf_counter() - started)
     assert min(seconds) < 0.001

@@ -20,10 +20,9 @@ MAX_LINES = 60
 SAVE_UNTRAINED = """
 import sys
 import numpy as np
-from foretrace.features import make_features
-from foretrace.predictor import LstmPredictor, save_checkpoint
+from foretrace.predictor import LstmConfig, save_checkpoint
 
-predictor = LstmPredictor(make_features("none"), num_samples=60)
+predictor = LstmConfig(features="none").make(num_samples=60)
 predictor.set_normalisation(np.zeros(3), np.ones(3), 0.05 * np.arange(60))
 save_checkpoint(sys.argv[1], predictor)
 """

@@ -21,7 +21,7 @@ from foretrace.export.episodes import Episodes, choose
 from foretrace.export.lerobot import export_lerobot
 from foretrace.geometry import pose_to_matrix
 from foretrace.interactions.dataset import Dataset
-from foretrace.predictor import TrainConfig, train_predictor
+from foretrace.predictor import LstmConfig, TrainConfig, train_predictor
 
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
 
@@ -198,8 +198,8 @@ def test_rerun_reads_it(folder):
 
 def test_episodes_are_split_as_the_training_was(tmp_path):
     data, run, other = fake_data(tmp_path / "data", 9), tmp_path / "run", fake_data(tmp_path / "other", 8)
-    config = TrainConfig(features="none", epochs=1, min_steps=1, split=(3, 2, 1), threads=1)
-    train_predictor(Dataset.open(data), config, run)
+    training = TrainConfig(epochs=1, min_steps=1, split=(3, 2, 1), threads=1)
+    train_predictor(Dataset.open(data), LstmConfig(features="none"), run, training)
     parts = json.loads((run / "split.json").read_text())
 
     def exported(source, name, *options) -> tuple[dict, list[int]]:

@@ -11,12 +11,12 @@ from factories import fake_batch
 from foretrace import cli
 from foretrace.errors import ExportError
 from foretrace.export import onnx as exporting
-from foretrace.export.networks import network_of
-from foretrace.features import ImageCnn, Outline, make_features
+from foretrace.export.networks import draw_inputs, network_of
+from foretrace.features import ImageCnn
 from foretrace.features.windows import convolve_unbranched, convolve_windows
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
+from foretrace.imagined import estimate_com
 from foretrace.predictor import LstmConfig, LstmPredictor, OneShotConfig, OneShotPredictor, save_checkpoint
-from foretrace.predictor.base import estimate_com
 from foretrace.predictor.states import state_size
 from test_examples import EXAMPLES, run_python
 
@@ -55,15 +55,17 @@ def shake(predictor, seed: int = 0):
 
 def one_shot() -> OneShotPredictor:
     torch.manual_seed(0)
-    settings = OneShotConfig(8, 2, 2, 4, outcomes=("levered", "slipped"))
-    return shake(OneShotPredictor(Outline(heights=True), SAMPLES, settings))
+    config = OneShotConfig(
+        feature_options={"heights": True}, hidden=8, layers=2, ensemble=2, components=4,
+        outcomes=("levered", "slipped"),
+    )  # fmt: skip
+    return shake(OneShotPredictor(config, SAMPLES))
 
 
 def image_cnn() -> LstmPredictor:
     torch.manual_seed(0)
-    predictor = LstmPredictor(
-        make_features("im-cnn", width=8), SAMPLES, LstmConfig("pose", hidden=8, known=("friction",))
-    )
+    config = LstmConfig(feature_options={"width": 8}, state="pose", hidden=8, context=("friction",))
+    predictor = LstmPredictor(config, SAMPLES)
     size = state_size("pose")
     predictor.set_normalisation(np.full(size, 0.01), np.full(size, 0.3), 0.05 * np.arange(SAMPLES))
     return predictor.eval()
@@ -121,7 +123,7 @@ def test_a_file_tells_what_it_is(command):
     assert facts["times"] == predictor.times.tolist()
     assert facts["predictor"] == "one-shot"
     assert facts["quantiles"] == pytest.approx(predictor.quantiles.tolist())
-    assert facts["features"] == {"label": "outline", "options": {"heights": True}}
+    assert facts["config"]["feature_options"] == {"heights": True}
     assert facts["frame"].startswith("action: origin at the contact point")
     assert {i.name: i.doc_string for i in model.graph.input} == network_of(predictor).inputs
     assert all(value.type.tensor_type.shape.dim[0].dim_param == "batch" for value in model.graph.output)
@@ -131,13 +133,17 @@ def test_a_file_tells_what_it_is(command):
 def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
     predictor = image_cnn()
     written = exporting.export_onnx(predictor, tmp_path / "model.onnx")
-    assert list(written.inputs) == ["mask", "com", "known"]
+    assert list(written.inputs) == ["mask", "com", "context"]
     assert list(written.outputs) == ["com_trajectory", "rotation_matrix"]
     assert max(written.differences.values()) <= exporting.TOLERANCE
     session = onnxruntime.InferenceSession(written.path)
     batch = fake_batch(np.random.default_rng(1), 3, num_samples=SAMPLES)
     com = estimate_com(batch).astype(np.float32)
-    inputs = {"mask": batch.mask.astype(np.uint8), "com": com, "known": batch.friction[:, None].astype("f4")}
+    inputs = {
+        "mask": batch.mask.astype(np.uint8),
+        "com": com,
+        "context": batch.friction[:, None].astype("f4"),
+    }
     path, rotation = session.run(None, inputs)
     imagined = predictor.imagine_batch(batch, "estimated")
     np.testing.assert_allclose(path, imagined.com, atol=1e-5)
@@ -145,14 +151,16 @@ def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("label", "state"), [("none", "position"), ("sc-200", "pose"), ("sp-truth", "position")]
+    ("label", "state"),
+    [("none", "position"), ("sc-200", "pose"), ("sp-truth", "position"), ("none", "turn")],
 )
 def test_other_features_are_inputs(label, state):
-    predictor = LstmPredictor(make_features(label), SAMPLES, LstmConfig(state, hidden=4))
+    predictor = LstmPredictor(LstmConfig(features=label, state=state, hidden=4), SAMPLES)
+    predictor.eval()
     network = network_of(predictor)
     rng = np.random.default_rng(0)
     for noise in (False, True):
-        inputs = network.draw(rng, 3, noise)
+        inputs = draw_inputs(network, rng, 3, noise)
         assert inputs["features"].shape == (3, predictor.features.num_features)
         with torch.no_grad():
             said = network(*map(torch.from_numpy, inputs.values()))

@@ -20,19 +20,11 @@ from foretrace.errors import CheckpointError
 from foretrace.imagined import LEVELS, conformal_scores
 from foretrace.interactions.dataset import Dataset
 from foretrace.pictures.scene import Scene, legend_of, scene_figure
-from foretrace.predictor import RECIPES, Futures, ImaginedEffect, checkpoint, part_of, train_predictor
+from foretrace.predictor import Futures, ImaginedEffect, OneShotConfig, checkpoint, part_of, train_predictor
 
 SAMPLES = 24
-CONFIG = replace(
-    RECIPES["one-shot"],
-    hidden=8,
-    predictor_options={"motions": 6},
-    epochs=2,
-    min_steps=1,
-    split=None,
-    outcomes=("levered", "slipped"),
-    device="cpu",
-)
+CONFIG = OneShotConfig(hidden=8, components=6, outcomes=("levered", "slipped"))
+TRAINING = replace(OneShotConfig.training, epochs=2, min_steps=1, split=None, device="cpu")
 SHIPPED = Path(ft.__file__).parent / "predictor" / "default"
 
 
@@ -49,12 +41,12 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(data: Path) -> Path:
-    return train_predictor(Dataset.open(data), CONFIG, data.parent / "run", progress=False)
+    return train_predictor(Dataset.open(data), CONFIG, data.parent / "run", TRAINING, progress=False)
 
 
 @pytest.fixture(scope="module")
 def card(run: Path, data: Path) -> str:
-    assert cli.main(["card", str(run), "--data", str(data)]) == 0
+    assert cli.main(["train", "--data", str(data), "--out", str(run), "--card"]) == 0
     return (run / "MODEL_CARD.md").read_text()
 
 
@@ -104,7 +96,8 @@ def test_nobody_says_more_than_is_known(capsys):
     assert radius_of(unsure) is None
     assert futures_content(unsure)["futures"][0]["radius"] is None
     assert outlook_of(unsure).radius is None
-    single = replace(unsure, futures=None)
+    com = unsure.com_trajectory[None]
+    single = replace(unsure, futures=Futures.point(com, None, "levered"))
     say_futures(single)
     assert capsys.readouterr() == ("", "")
     assert futures_content(single) == {"warnings": []}
@@ -224,13 +217,16 @@ def test_the_card_has_the_errors_of_the_test_part(card: str, run: Path, data: Pa
 def test_the_command_on_the_card_asks_for_the_same_training(card: str, run: Path, monkeypatch) -> None:
     asked = []
     monkeypatch.setattr(
-        "foretrace.predictor.train_predictor", lambda data, config, out, **_: asked.append(config)
+        "foretrace.predictor.train_predictor",
+        lambda data, config, out, training, **_: asked.append((config, training)),
     )
     command = re.search(r"^\$ foretrace (train .*)$", card, re.MULTILINE)
     assert command is not None
     assert cli.main(command[1].split()) == 0
     # What is no option of the command was made small for this test.
-    assert replace(asked[0], min_steps=1, device="cpu") == CONFIG
+    config, training = asked[0]
+    assert config == CONFIG
+    assert replace(training, min_steps=1, device="cpu", outcomes=None) == TRAINING
     assert json.loads((run / "environment.json").read_text())["versions"]["torch"] in card
 
 
@@ -238,5 +234,5 @@ def test_a_card_needs_the_data_of_the_run(run: Path, tmp_path: Path, capsys) -> 
     other = write_data(
         tmp_path / "data", factories.fake_interactions(np.random.default_rng(1), 4, num_samples=SAMPLES)
     )
-    assert cli.main(["card", str(run), "--data", str(other)]) == 2
+    assert cli.main(["train", "--data", str(other), "--out", str(run), "--card"]) == 2
     assert "give the data set that it was trained on" in capsys.readouterr().err

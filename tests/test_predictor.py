@@ -10,8 +10,8 @@ from factories import fake_batch
 from foretrace.errors import PredictionError
 from foretrace.features import NoFeatures
 from foretrace.geometry import quaternion_to_matrix
-from foretrace.interactions.topdown import TopDownView
 from foretrace.imagined import estimate_com
+from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor import LstmConfig, LstmPredictor
 from foretrace.predictor.lstm import ProjectedLstm
 from foretrace.predictor.states import (

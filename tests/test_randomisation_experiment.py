@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foretrace.predictor.context import PARAMETERS
 from rich.console import Console
 
 import factories
@@ -37,7 +38,6 @@ from foretrace.imagined import ImaginedBatch
 from foretrace.interactions.record import Outcome, Physics
 from foretrace.predictor import TrainConfig
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.context import PARAMETERS
 from foretrace.simulation.collect import CollectConfig, collect, trial
 from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION, Randomisation
 from foretrace.simulation.stand_in import StandIn

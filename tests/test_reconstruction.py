@@ -4,7 +4,7 @@ import pytest
 from factories import QUICK_OPTIONS, fake_batch
 from foretrace.errors import PredictionError
 from foretrace.experiments.reconstruction import overlap, reconstruct_masks, reconstruction_figure
-from foretrace.predictor import TrainConfig
+from foretrace.predictor import LstmConfig
 
 
 @pytest.fixture(scope="module")
@@ -13,14 +13,14 @@ def batch():
 
 
 def test_masks_come_back_in_their_shape(batch):
-    predictor = TrainConfig("ae-256", dict(QUICK_OPTIONS["ae-256"]), hidden=8).make_predictor(12)
+    predictor = LstmConfig(features="ae-256", feature_options=dict(QUICK_OPTIONS["ae-256"]), hidden=8).make(12)
     restored = reconstruct_masks(predictor, batch)
     assert restored.shape == batch.mask.shape
     assert restored.dtype == bool
 
 
 def test_other_features_have_nothing_to_restore_from(batch):
-    predictor = TrainConfig("none", hidden=8).make_predictor(12)
+    predictor = LstmConfig(features="none", hidden=8).make(12)
     with pytest.raises(PredictionError, match="features 'none' have no code"):
         reconstruct_masks(predictor, batch)
 

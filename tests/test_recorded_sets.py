@@ -13,7 +13,7 @@ from foretrace.experiments.transfer_recorded import levered_edge
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.recorded import NOTES_FOLDER, add_recorded, read_notes
 from foretrace.perception.recordings import open_recording
-from foretrace.predictor import TrainConfig, load_predictor, train_predictor
+from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, train_predictor
 from foretrace.trajectories import mean_distance
 
 pytestmark = pytest.mark.slow
@@ -65,8 +65,8 @@ def test_films_of_a_data_set_come_back_as_they_were(simulated: Path, recorded: P
 def test_recordings_are_learned_from_and_judged_like_simulations(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = TrainConfig(features="none", epochs=1, min_steps=1, split=(1, 1, 1), threads=1)
-    train_predictor(Dataset.open(recorded), config, tmp_path / "run")
+    training = TrainConfig(epochs=1, min_steps=1, split=(1, 1, 1), threads=1)
+    train_predictor(Dataset.open(recorded), LstmConfig(features="none"), tmp_path / "run", training)
     assert main(["evaluate", "predictor", str(tmp_path / "run"), "--data", str(recorded)]) == 0
     assert "levered" in capsys.readouterr().out
     imagined = load_predictor(tmp_path / "run").imagine_batch(Dataset.open(recorded).batch())

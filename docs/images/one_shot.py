@@ -15,7 +15,7 @@ from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import Prism
 from foretrace.pictures.scene import INK, OBJECT_COLOR, OBJECT_EDGE, STYLE, TOOL_COLOR
-from foretrace.predictor.pivot_edges import NUM_VALUES, RIM, find_hinges
+from foretrace.predictor.pivot_edges import NUM_VALUES, RIM, find_pivot_edges
 
 CORNERS = np.array(
     [[0.055, -0.045], [0.075, 0.012], [0.03, 0.055], [-0.03, 0.045], [-0.06, -0.01], [-0.035, -0.05]]
@@ -33,12 +33,12 @@ def main() -> None:
     com = T[:3, :3] @ prism.mass_properties(1.0).com + T[:3, 3]
     rows = np.repeat(hull[:1], 24, axis=0)
     rows[: len(hull)] = hull
-    hinges = find_hinges(torch.from_numpy(rows[None]), torch.from_numpy(com[None]))
+    edges = find_pivot_edges(torch.from_numpy(rows[None]), torch.from_numpy(com[None]))
     with mpl.rc_context(STYLE):
         fig = Figure(figsize=(12, 4.3), layout="constrained")
         left, middle, right = fig.subplots(1, 3, width_ratios=[1, 1, 1.15])
         _pixels(left, view, hull)
-        _hinges(middle, hull, com, hinges)
+        _pivot_edges(middle, hull, com, edges)
         _futures(right)
         fig.savefig(Path(__file__).with_name("one-shot.png"), dpi=110)
 
@@ -69,7 +69,7 @@ def _pixels(ax, view: TopDownView, hull: np.ndarray) -> None:
     _frame(ax, "1  From mask to hull")
 
 
-def _hinges(ax, hull: np.ndarray, com: np.ndarray, hinges) -> None:
+def _pivot_edges(ax, hull: np.ndarray, com: np.ndarray, edges) -> None:
     ax.add_patch(Polygon(hull[:, ::-1] * [-1, 1], facecolor=OBJECT_COLOR, alpha=0.3, edgecolor=OBJECT_EDGE))
     bottom = shapely.get_coordinates(shapely.Polygon(hull).buffer(-RIM, join_style="mitre"))
     ax.plot(-bottom[:, 1], bottom[:, 0], color=OBJECT_EDGE, lw=1, ls=(0, (1, 1.5)))
@@ -80,10 +80,10 @@ def _hinges(ax, hull: np.ndarray, com: np.ndarray, hinges) -> None:
     ax.plot([-lift[1], -end[1]], [lift[0], end[0]], color=INK, lw=1, ls=(0, (4, 2)))
     ax.plot(-com[1], com[0], "o", color=INK, ms=6)
     ax.text(-com[1] + 0.006, com[0] - 0.002, "centre of mass", fontsize=10)
-    for k, (color, name) in enumerate(((FIRST, "first hinge"), (SECOND, "second hinge"))):
-        a, b = hinges.ends[0, k].numpy()
+    for k, (color, name) in enumerate(((FIRST, "first pivot edge"), (SECOND, "second pivot edge"))):
+        a, b = edges.ends[0, k].numpy()
         ax.plot([-a[1], -b[1]], [a[0], b[0]], color=color, lw=4, solid_capstyle="round")
-        out = hinges.axes[0, 0, k, 0, :2].numpy()
+        out = edges.axes[0, 0, k, 0, :2].numpy()
         at = (a + b) / 2
         ax.add_patch(
             FancyArrowPatch((-at[1], at[0]), (-at[1] - 0.03 * out[1], at[0] + 0.03 * out[0]), color=color,
@@ -92,13 +92,13 @@ def _hinges(ax, hull: np.ndarray, com: np.ndarray, hinges) -> None:
         spot = at + 0.034 * out
         ax.text(-spot[1], spot[0], name, color=color, fontsize=10, ha="center", va="bottom")
     _blade(ax)
-    _frame(ax, f"2  Two hinges, {NUM_VALUES} numbers each")
+    _frame(ax, f"2  Two pivot edges, {NUM_VALUES} numbers each")
 
 
 def _futures(ax) -> None:
     boxes = (
-        (FIRST, 2.05, ("probability", "weights of 32 principal motions", "expected error")),
-        (SECOND, 0.55, ("probability", "weights of 32 principal motions", "expected error")),
+        (FIRST, 2.05, ("probability", "weights of 32 PCA components", "expected error")),
+        (SECOND, 0.55, ("probability", "weights of 32 PCA components", "expected error")),
     )
     for color, y, words in boxes:
         ax.add_patch(Rectangle((0, y), 1.55, 0.8, facecolor="white", edgecolor=color, lw=1.8))

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from foretrace.actions import LeverUp, ToolPath
     from foretrace.errors import ForetraceError
+    from foretrace.features import FeatureExtractor
     from foretrace.interactions.dataset import Dataset, InteractionBatch
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import Bevel, Box, Cylinder, MeshObject, Prism, paper_objects, sample_prism
-    from foretrace.features import FeatureExtractor
     from foretrace.predictor import (
         EffectPredictor,
         LstmConfig,
@@ -39,7 +39,14 @@ _HOMES = {
     "foretrace.objects": ("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "paper_objects", "sample_prism"),
     "foretrace.features": ("FeatureExtractor",),
     "foretrace.predictor": (
-        *("EffectPredictor", "LstmConfig", "ObservedMotion", "OneShotConfig", "PredictorConfig", "TrainConfig"),
+        *(
+            "EffectPredictor",
+            "LstmConfig",
+            "ObservedMotion",
+            "OneShotConfig",
+            "PredictorConfig",
+            "TrainConfig",
+        ),
         *("load_predictor", "train_predictor"),
     ),
     "foretrace.simulation.collect": ("CollectConfig", "collect"),

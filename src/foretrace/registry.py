@@ -91,6 +91,11 @@ class Registry(Mapping[str, T], Generic[T]):
                 self._entries[entry.name] = found
 
 
+def adds_anything(subclass: type) -> bool:
+    """Whether a class body defines anything: one that does not, such as torch's tracer makes, stands for its parent."""
+    return any(not name.startswith("__") for name in subclass.__dict__)
+
+
 def _same_place(one: Any, other: Any) -> bool:
     """Whether two classes are the same one, defined again, as in a notebook or after a reload."""
     names = ("__module__", "__qualname__")

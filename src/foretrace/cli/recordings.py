@@ -91,6 +91,9 @@ def _notes(recording: Path, camera: "PinholeCamera", found: Any) -> dict[str, An
     """What is kept beside an interaction: enough to draw it onto the recording again."""
     import numpy as np
 
+    def plain(values: np.ndarray) -> list[float | None]:
+        return [float(value) if np.isfinite(value) else None for value in values]
+
     track = found.track
     deviations = np.sqrt(np.diagonal(track.covariance, axis1=1, axis2=2))
     return {
@@ -101,11 +104,7 @@ def _notes(recording: Path, camera: "PinholeCamera", found: Any) -> dict[str, An
         "frame_times": track.times.tolist(),
         "seen": track.seen.tolist(),
         "corner_noise_pixels": track.noise,
-        "reprojection_error_pixels": [None if not np.isfinite(v) else float(v) for v in track.errors],
-        "rotation_deviation_rad": [
-            None if not np.isfinite(v).all() else float(max(v)) for v in deviations[:, :3]
-        ],
-        "position_deviation_m": [
-            None if not np.isfinite(v).all() else float(max(v)) for v in deviations[:, 3:]
-        ],
+        "reprojection_error_pixels": plain(track.errors),
+        "rotation_deviation_rad": plain(deviations[:, :3].max(axis=1)),
+        "position_deviation_m": plain(deviations[:, 3:].max(axis=1)),
     }

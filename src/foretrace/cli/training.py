@@ -9,11 +9,18 @@ from typing import Annotated, Any, get_type_hints
 import docstring_parser
 from tyro.conf import OmitArgPrefixes, arg
 
+from foretrace import predictor as learned
 from foretrace.cli.console import say
 from foretrace.cli.parsing import without
 from foretrace.features import FEATURES, FeatureExtractor
+from foretrace.files import write_text
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.record import Outcome
+from foretrace.interactions.splits import PAPER_SIZES
 from foretrace.predictor import PREDICTORS, PredictorConfig, TrainConfig
 from foretrace.predictor.config import feature_option
+from foretrace.predictor.model_card import model_card
+from foretrace.predictor.run_folder import RunFolder
 
 CARD = "MODEL_CARD.md"
 
@@ -48,7 +55,12 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
     ) -> None:
         values = [(each, getattr(extractor, each.name)) for each in fields(extractor)]
         given = {each.metadata["name"]: value for each, value in values if value != each.default}
-        _train(data, out, replace(config, feature_options=given), training, split, fresh, card)
+        named = {word.partition("=")[0] for word in words if word.startswith("--")}
+        if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
+            _train(data, out, replace(config, feature_options=given), training, split, fresh)
+        if card:
+            write_text(out / CARD, model_card(out, data))
+            print(out / CARD)
 
     train.__doc__ = f"""Train a predictor on a data set.
 
@@ -65,7 +77,8 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         split: Sizes of the training, validation and test parts; by default the paper's 1400 100 300, or in the same
             proportions where there are fewer interactions.
         fresh: Discard the training in the folder instead of continuing it.
-        card: Write a model card to the folder, too: data, errors and calibration on the test part, limits.
+        card: Write a model card to the folder, too: data, errors and calibration on the test part, limits. A finished
+            training needs no other options than --data and --out.
     """
     train.__annotations__ |= {
         "config": Annotated[OmitArgPrefixes[config_class], arg(name=label)],
@@ -114,25 +127,14 @@ def _train(
     training: TrainConfig,
     split: tuple[int, int, int] | None,
     fresh: bool,
-    card: bool,
 ) -> None:
-    from foretrace.files import write_text
-    from foretrace.interactions.dataset import Dataset
-    from foretrace.interactions.record import Outcome
-    from foretrace.interactions.splits import PAPER_SIZES
-    from foretrace.predictor import train_predictor
-    from foretrace.predictor.model_card import model_card
-
     outcomes = training.outcomes or getattr(config, "outcomes", None) or (str(Outcome.LEVERED),)
     dataset = Dataset.open(data).where(outcome=outcomes)
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
     try:
-        train_predictor(dataset, config, out, replace(training, split=split), resume=not fresh)
+        learned.train_predictor(dataset, config, out, replace(training, split=split), resume=not fresh)
     except KeyboardInterrupt:
         say(f"interrupted; the best model so far is in {out}, the same command goes on from there")
         raise
     print(f"predictor: {out}")
-    if card:
-        write_text(out / CARD, model_card(out, data))
-        print(out / CARD)

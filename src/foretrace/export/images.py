@@ -92,3 +92,15 @@ def render_images(
             rgb[k] = render(renderer, data, "beside")
             depth[k] = render(renderer, data, "beside", depth=True)
     return RenderedImages(rgb, depth, CAMERA, pose)
+
+
+def images_of_samples(interaction: Interaction) -> RenderedImages | None:
+    """Images of a simulated interaction at its samples; None for a recorded one.
+
+    Raises:
+        ExportError: The machine cannot render.
+    """
+    if interaction.provenance.source != "simulated":
+        return None
+    effect = interaction.effect
+    return render_images(interaction, effect.pose_trajectory, effect.tool_trajectory)

@@ -1,6 +1,7 @@
 """Interactions as a LeRobotDataset v3.0: Parquet files and their description, which LeRobot's loader reads."""
 
 import io
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,14 +44,8 @@ VIEW, COLOUR, DEPTH = (
 )
 IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 INDICES = {
-    name: {"dtype": kind, "shape": [1], "names": None}
-    for name, kind in (
-        ("timestamp", "float32"),
-        ("frame_index", "int64"),
-        ("episode_index", "int64"),
-        ("index", "int64"),
-        ("task_index", "int64"),
-    )
+    name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
+    for name in ("timestamp", "frame_index", "episode_index", "index", "task_index")
 }
 """The columns that every such data set has."""
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
-from foretrace.export.images import RenderedImages, render_images
+from foretrace.export.images import RenderedImages, images_of_samples
 from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, Colour, tool_parts
 from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Effect
@@ -46,9 +46,7 @@ def write_recording(episode: Episode, path: Path, camera: bool) -> None:
     """Write one interaction to one file."""
     interaction = episode.interaction
     effect = interaction.effect
-    seen = None
-    if camera and interaction.provenance.source == "simulated":
-        seen = render_images(interaction, effect.pose_trajectory, effect.tool_trajectory)
+    seen = images_of_samples(interaction) if camera else None
     # Ids of its own, and no properties: equal interactions give recordings of equal contents.
     recording = rr.RecordingStream(
         APPLICATION, recording_id=f"interaction-{interaction.id}", send_properties=False

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores
 
 from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
-from foretrace.export.images import RenderedImages, render_images
+from foretrace.export.images import RenderedImages, images_of_samples
 from foretrace.export.messages import TRANSFORMS, Messages
 from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, tool_parts
 from foretrace.geometry import matrix_to_pose
@@ -95,10 +95,7 @@ def export_rosbags(
 def stamped_messages(episode: Episode, make: Messages, camera: bool) -> list[Stamped]:
     """Everything that a bag holds, in the order of time."""
     interaction = episode.interaction
-    seen = None
-    if camera and interaction.provenance.source == "simulated":
-        effect = interaction.effect
-        seen = render_images(interaction, effect.pose_trajectory, effect.tool_trajectory)
+    seen = images_of_samples(interaction) if camera else None
     messages = [
         *_at_rest(episode, make, seen),
         *_moving_frames(episode, make),

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from foretrace.errors import TrainingError
 from foretrace.interactions.candidates import Candidates
 from foretrace.interactions.dataset import InteractionBatch
-from foretrace.registry import Registry
+from foretrace.registry import Registry, adds_anything
 
 Option = bool | int | float | str
 """A setting of a feature extractor, as written into a checkpoint's ``config.json``."""
@@ -80,7 +80,7 @@ class FeatureExtractor(nn.Module, ABC):
 
     def __init_subclass__(cls, abstract: bool = False, **more: Any) -> None:
         super().__init_subclass__(**more)
-        if not abstract:
+        if not abstract and adds_anything(cls):
             if "label" not in cls.__dict__:
                 raise TypeError(f"{cls.__name__} needs a label of its own, or abstract=True")
             FEATURES.add(cls.label, cls)

@@ -62,7 +62,7 @@ def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]
 def true_context(
     physics: Physics, names: Sequence[str], parameters: Mapping[str, float] | None = None
 ) -> dict[str, float]:
-    """True values of one interaction's context, in SI units, by the given names; those of the nominal path by default."""
+    """True values of one interaction's context [SI] by the given names; those of the nominal path by default."""
     values = asdict(physics) | dict(nominal_parameters() if parameters is None else parameters)
     return {name: values[name] for name in names}
 
@@ -73,7 +73,9 @@ def recorded_context(batch: InteractionBatch, names: Sequence[str]) -> Float[np.
     Raises:
         PredictionError: One of them lacks a value.
     """
-    values = np.array([column_of(batch, name) for name in names], dtype=float).reshape(len(names), len(batch)).T
+    values = (
+        np.array([column_of(batch, name) for name in names], dtype=float).reshape(len(names), len(batch)).T
+    )
     rows, columns = np.nonzero(~np.isfinite(values))
     if len(rows):
         name = names[columns[0]]
@@ -102,7 +104,9 @@ def given_context(
     known = {name: value for name, value in (parameters or {}).items() if name in names} | context
     if missing := [name for name in names if name not in known]:
         wanted = ", ".join(f"{name!r}: value {CONTEXT[name]}" for name in names)
-        raise PredictionError(f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}")
+        raise PredictionError(
+            f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}"
+        )
     if odd := [name for name in context if name not in names]:
         accepted = ", ".join(names) or "nothing but the view"
         raise PredictionError(

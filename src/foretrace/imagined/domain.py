@@ -143,7 +143,9 @@ def _rim(mask: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "k 2"]:
     return (CONTACT_PIXEL - np.argwhere(kept > inner)) * METRES_PER_PIXEL
 
 
-def _look_up(mask: Bool[np.ndarray, "rows columns"], points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+def _look_up(
+    mask: Bool[np.ndarray, "rows columns"], points: Float[np.ndarray, "n 2"]
+) -> Bool[np.ndarray, " n"]:
     """Whether points [m] lie in the mask."""
     pixels = np.rint(CONTACT_PIXEL - points / METRES_PER_PIXEL).astype(int)
     there = ((pixels >= 0) & (pixels < mask.shape)).all(axis=1)

@@ -190,7 +190,9 @@ class Imaginer(ABC):
         scenes = Scenes(candidates, candidates.enter(middle), np.concatenate(values))
         return self._answer(scenes, parameters)
 
-    def _answer(self, scenes: Scenes, parameters: list[dict[str, float]] | dict[str, np.ndarray]) -> ImaginedBatch:
+    def _answer(
+        self, scenes: Scenes, parameters: list[dict[str, float]] | dict[str, np.ndarray]
+    ) -> ImaginedBatch:
         """What it imagines, with warnings about paths that it is not conditioned on."""
         if isinstance(parameters, list):
             names = parameters[0]

@@ -48,7 +48,7 @@ class ObservedMotion:
         lengths = {len(values) for values in (self.times, self.poses, self.com) if values is not None}
         if len(lengths) > 1 or not len(self.times):
             raise PredictionError(
-                f"{len(self.times)} times and {len(self.poses)} poses of an observed motion: give one pose for each time"
+                f"{len(self.times)} times and {len(self.poses)} poses of an observed motion: give one pose a time"
             )
         if (steps := np.diff(self.times)).size and steps.min() <= 0:
             k = int(steps.argmin())
@@ -66,8 +66,8 @@ class ObservedMotion:
         turned = np.linalg.norm(self._rotations()[first], axis=1).max()
         if moved > REST_DISTANCE or turned > REST_ANGLE:
             raise PredictionError(
-                f"the observed object moves by {100 * moved:.1f} cm and turns by {np.degrees(turned):.0f} degrees in the "
-                f"first {REST_TIME:g} s: give samples from rest on, before the blade touches it"
+                f"the observed object moves by {100 * moved:.1f} cm and turns by {np.degrees(turned):.0f} degrees "
+                f"in the first {REST_TIME:g} s: give samples from rest on, before the blade touches it"
             )
 
     @classmethod
@@ -122,7 +122,7 @@ class ObservedMotion:
 
 
 def rotations_since_rest(poses: Float[np.ndarray, "*batch time 7"]) -> Float[np.ndarray, "*batch time 3"]:
-    """Rotation vectors about the action frame's axes since the first sample [rad], the same whatever the object frame."""
+    """Rotation vectors since the first sample [rad], about the action frame's axes, whatever the object frame."""
     rotations = quaternion_to_matrix(poses[..., 3:])
     return continuous_rotation_vectors(rotations @ np.swapaxes(rotations[..., :1, :, :], -1, -2))
 
@@ -138,8 +138,8 @@ def observed_motion(observed: Any) -> ObservedMotion:
     if isinstance(observed, Effect):
         return ObservedMotion.of(observed)
     raise PredictionError(
-        f"observed is a {type(observed).__name__}: give an Effect, or ObservedMotion(times, poses) with the object's poses "
-        "in the action frame"
+        f"observed is a {type(observed).__name__}: give an Effect, or ObservedMotion(times, poses) with the object's "
+        "poses in the action frame"
     )
 
 

@@ -159,7 +159,9 @@ class TopDownView:
             action: The action, in this view's frame.
         """
         centres = _pixel_centres().reshape(-1, 2)
-        return TopDownView(*self._resampled(_pixels_of(_to_object(centres, action)).reshape(VIEW_SIZE, VIEW_SIZE, 2)))
+        return TopDownView(
+            *self._resampled(_pixels_of(_to_object(centres, action)).reshape(VIEW_SIZE, VIEW_SIZE, 2))
+        )
 
     def _resampled(
         self, pixels: Float[np.ndarray, "128 128 2"]

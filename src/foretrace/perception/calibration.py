@@ -13,14 +13,7 @@ from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
-from foretrace.perception.markers import (
-    Detections,
-    MarkerBody,
-    dictionary,
-    grey,
-    image_fault,
-    to_transform,
-)
+from foretrace.perception.markers import Detections, MarkerBody, dictionary, grey, image_fault, to_transform
 
 FEWEST_IMAGES = 5
 """Least number of images that show the board."""
@@ -112,10 +105,7 @@ class Board:
         return known[np.ravel(ids).astype(int)], np.asarray(corners, dtype=float).reshape(-1, 2)
 
     def pose(
-        self,
-        image: UInt8[np.ndarray, "rows columns *channels"],
-        camera: PinholeCamera,
-        name: str = "image",
+        self, image: UInt8[np.ndarray, "rows columns *channels"], camera: PinholeCamera, name: str = "image"
     ) -> Float[np.ndarray, "4 4"]:
         """T_board_camera: the camera's pose over a board that lies on the table, whose frame is the table frame.
 

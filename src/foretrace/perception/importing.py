@@ -23,13 +23,7 @@ from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Effect, Interaction, Provenance
 from foretrace.interactions.recording_folder import Frame
 from foretrace.objects import BEVEL, ObjectModel
-from foretrace.perception.markers import (
-    Detections,
-    MarkerLayout,
-    align_patterns,
-    detect_markers,
-    image_fault,
-)
+from foretrace.perception.markers import Detections, MarkerLayout, align_patterns, detect_markers, image_fault
 from foretrace.perception.masks import DEPTH_RIM, find_by_background, find_by_height, heights_above_table
 from foretrace.perception.recordings import Recording
 from foretrace.perception.tracking import Track, TrackConfig, check_times, still_pose, track

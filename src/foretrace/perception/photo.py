@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.interactions.recording_folder import CAMERA, MARKERS, read_depth, read_image, write_image
+from foretrace.interactions.recording_folder import CAMERA, MARKERS, read_depth, read_image
 from foretrace.objects import BEVEL
 from foretrace.objects.prism import DEFAULT_HEIGHT
 from foretrace.perception import masks
@@ -94,19 +94,6 @@ class PhotoView(Observation):
         paths = {} if predicted is None else {"predicted": (predicted, PREDICTED)}
         radii = None if radius is None or predicted is None else {"predicted": radius}
         return draw_overlay(self.image, self.camera, self.T_action_camera, self.outline, paths, radii=radii)
-
-    def save_overlay(
-        self,
-        path: Path,
-        predicted: Float[np.ndarray, "time 3"] | None = None,
-        radius: Float[np.ndarray, " time"] | None = None,
-    ) -> None:
-        """Write `overlay` to an image file.
-
-        Raises:
-            PerceptionError: It cannot be written there.
-        """
-        write_image(path, self.overlay(predicted, radius))
 
 
 def observe_photo(

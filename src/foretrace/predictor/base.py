@@ -28,7 +28,7 @@ from foretrace.predictor.states import (
     state_size,
     valid_lengths,
 )
-from foretrace.registry import Registry
+from foretrace.registry import Registry, adds_anything
 
 if TYPE_CHECKING:
     from foretrace.predictor.traced import TracedPredictor
@@ -42,8 +42,8 @@ class EffectPredictor(Imaginer, nn.Module):
 
     A subclass has a ``label``, a ``config_class`` and two methods, `training_loss` and `roll_out`; everything between
     arrays in metres and normalised states is done here. Further methods are hooks, which do nothing or the usual unless
-    they are overridden. Defining the subclass registers it in PREDICTORS; ``class Base(EffectPredictor, abstract=True)``
-    is not registered. The constructor takes ``(config, num_samples)``.
+    they are overridden. Defining the subclass registers it in PREDICTORS, except with ``abstract=True`` behind the base
+    class. The constructor takes ``(config, num_samples)``.
 
     Normalisation and sample times are tensors of the checkpoint, set once from the training part.
 
@@ -68,15 +68,17 @@ class EffectPredictor(Imaginer, nn.Module):
 
     def __init_subclass__(cls, abstract: bool = False, **more: Any) -> None:
         super().__init_subclass__(**more)
-        if abstract:
+        if abstract or not adds_anything(cls):
             return
         own = cls.__dict__.get("config_class")
         if "label" not in cls.__dict__ or not (isinstance(own, type) and issubclass(own, PredictorConfig)):
             raise TypeError(
-                f"{cls.__name__} needs a label and a config_class of its own, a subclass of PredictorConfig; or abstract=True"
+                f"{cls.__name__} needs a label and a config_class of its own, a PredictorConfig; or abstract=True"
             )
         if "predictor_class" in own.__dict__ and own.predictor_class.__qualname__ != cls.__qualname__:
-            raise TypeError(f"{own.__name__} makes {own.predictor_class.__name__} already: give {cls.__name__} its own")
+            raise TypeError(
+                f"{own.__name__} makes {own.predictor_class.__name__} already: give {cls.__name__} its own"
+            )
         PREDICTORS.add(cls.label, cls)
         own.predictor_class = cls
 
@@ -132,7 +134,7 @@ class EffectPredictor(Imaginer, nn.Module):
 
     @property
     def feature_weights(self) -> list[nn.Parameter]:
-        """Weight matrices that features are multiplied with, which decay with the number of features; none by default."""
+        """Weight matrices of the features, which decay with the number of features; none by default."""
         return []
 
     def lengths(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:

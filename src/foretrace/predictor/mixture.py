@@ -40,7 +40,10 @@ class Mixture:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
         rows = torch.arange(len(self.com), device=self.com.device)
         best = self.log_probability.flatten(1).argmax(dim=1)
-        weights, axes = self.mean.flatten(1, 2)[rows, best], self.axes[rows, best // self.log_probability.shape[2]]
+        weights, axes = (
+            self.mean.flatten(1, 2)[rows, best],
+            self.axes[rows, best // self.log_probability.shape[2]],
+        )
         return self._states(weights[:, None, None], axes[:, None])[:, 0]
 
     def states(self) -> Float[Tensor, "batch futures time 6"]:
@@ -50,7 +53,9 @@ class Mixture:
     def sample(self, num: int, generator: torch.Generator | None = None) -> Float[Tensor, "batch num time 6"]:
         """Positions [m] and rotation vectors [rad] drawn at random."""
         rows = torch.arange(len(self.com), device=self.com.device)[:, None]
-        chosen = torch.multinomial(self.log_probability.flatten(1).exp(), num, replacement=True, generator=generator)
+        chosen = torch.multinomial(
+            self.log_probability.flatten(1).exp(), num, replacement=True, generator=generator
+        )
         z = torch.randn(*chosen.shape, self.mean.shape[-1], generator=generator, device=self.mean.device)
         root, error = torch.linalg.cholesky(self.covariance), self.error.flatten(1)[rows, chosen]
         off = error[..., None] * (root[chosen % len(root)] @ z[..., None])[..., 0]
@@ -70,7 +75,9 @@ class Mixture:
         axes: Float[Tensor, "batch edges 3 3"],
     ) -> Float[Tensor, "batch edges*futures time 6"]:
         shape = (*weights.shape[:3], 2, 3)  # displacements and turns
-        motion = torch.addmm(self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.components.mT.flatten(1))
+        motion = torch.addmm(
+            self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.components.mT.flatten(1)
+        )
         back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)
         rest = F.pad(self.com, (0, 3)).unflatten(1, (2, 3))[:, None, None].expand(shape)
         # One product with time last: memory is gone through once, in long rows.

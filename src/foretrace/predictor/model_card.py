@@ -2,19 +2,19 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from foretrace.errors import TrainingError
-from foretrace.files import flatten, read_json
+from foretrace.files import as_json, flatten, read_json
 from foretrace.imagined import LEVELS, STARTS, conformal_scores
 from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
-from foretrace.predictor import PREDICTORS, EffectPredictor, TrainConfig, load_predictor, part_of
+from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
 from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.config import feature_option
 from foretrace.predictor.run_folder import ENVIRONMENT
@@ -28,7 +28,7 @@ CM = 100.0
 RUNTIME_OPTIONS = ("min_steps", "device", "precision", "threads")
 """Settings of a training that the card's command leaves at their defaults."""
 LIMITS = """\
-- It imagines one action, the lever-up, with the tool path of its data, and rigid objects that lie alone on a flat table.
+- It imagines lever-ups with the tool path of its data, on rigid objects that lie alone on a flat table.
 - It has learned from simulation. How far a real object is from it is not part of this card.
 - Probabilities and regions hold for lever-ups like those in the data: an object that is unlike them is pointed out, an
   unlike friction, density, rim or tool is not.
@@ -71,8 +71,9 @@ def _about(predictor: EffectPredictor) -> str:
     outcomes = f", distinguishes {', '.join(predictor.outcomes)}" if predictor.outcomes else ""
     imagined = "the centre of mass" if predictor.state == "position" else "the pose"
     return (
-        f"Imagines {imagined} of a levered object from the view from above: {len(times)} samples in {times[-1]:.2f} s, in "
-        f"the action frame, SI units{context}{outcomes}. {sum(p.numel() for p in predictor.parameters())} weights."
+        f"Imagines {imagined} of a levered object from the view from above: {len(times)} samples in "
+        f"{times[-1]:.2f} s, in the action frame, SI units{context}{outcomes}. "
+        f"{sum(p.numel() for p in predictor.parameters())} weights."
     )
 
 
@@ -91,22 +92,20 @@ def _data(
 
 
 def _training(run: Path, data: Path) -> str:
-    content = read_config(run)
-    config_class, training = PREDICTORS.find(content["predictor"]).config_class, content["training"]
-    command = [f"foretrace train --data {data} --out {run} --predictor {content['predictor']}"]
-    options = dict(content["config"])
+    content, predictor = read_config(run), load_predictor(run)
+    nominal = as_json(asdict(type(predictor.config)()))
+    options = {name: value for name, value in content["config"].items() if value != nominal.get(name)}
     given = options.pop("feature_options", {})
-    options |= {feature_option(name, config_class): value for name, value in given.items()}
+    options |= {feature_option(name, type(predictor.config)): value for name, value in given.items()}
+    training = content["training"]
     options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
+    command = [f"foretrace train --data {data} --out {run} --predictor {predictor.label}"]
     for name, value in options.items():
-        option = name.replace("_", "-")
-        if name in RUNTIME_OPTIONS or value is None or value == []:
+        if name in RUNTIME_OPTIONS or value is None:
             continue
-        if not isinstance(value, bool):
-            values = value if isinstance(value, list) else [value]
-            command.append(f"--{option} {' '.join(map(str, values))}")
-        elif value != getattr(config_class, name, False):
-            command.append(f"--{'' if value else 'no-'}{option}")
+        values = [] if isinstance(value, bool) else value if isinstance(value, list) else [value]
+        option = f"--{'no-' if value is False else ''}{name.replace('_', '-')}"
+        command.append(" ".join([option, *map(str, values)]))
     environment = read_json(run / ENVIRONMENT, TrainingError, "give the whole folder of a training")
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return (

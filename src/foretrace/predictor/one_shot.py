@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
-from torch.nn import functional as F
+from torch import Tensor
 
 from foretrace.errors import TrainingError
 from foretrace.features import Outline
@@ -35,7 +34,7 @@ SAME = 0.01
 FEW = 10
 """Lever-ups of an outcome from which on its residuals' size is estimated from them."""
 LARGEST_ERROR = 1.5
-"""Logarithm of the largest error scale, in units of the position's scale: outputs for improbable futures are arbitrary."""
+"""Logarithm of the largest error scale, in units of the position's: outputs for improbable futures are arbitrary."""
 DISAGREEMENT = 8.0
 """Error scale per distance between the outputs of networks and mirror images.
 
@@ -128,7 +127,11 @@ class OneShotPredictor(EffectPredictor):
                 "features 'outline'"
             )
         self.heights = self.features.heights
-        numbers, outcomes, components = NUM_VALUES + self.heights * PROBES**2, len(self.outcomes), config.components
+        numbers, outcomes, components = (
+            NUM_VALUES + self.heights * PROBES**2,
+            len(self.outcomes),
+            config.components,
+        )
         widths = (config.hidden,) * config.layers
         self.networks = Ensemble(
             config.ensemble, (numbers + len(self.context), *widths, outcomes * (components + 2))
@@ -154,7 +157,7 @@ class OneShotPredictor(EffectPredictor):
         """Find the PCA basis of the training part's trajectories, and the scale of values relative to edges.
 
         A shorter trajectory counts as if it stayed where it ends. Components are found separately for the coordinates
-        that stay the same in a mirror and those that change their sign, so each is its own mirror image, up to its sign.
+        that stay the same in a mirror and those that change their sign: each is its own mirror image, up to its sign.
         """
         edges = self._find_edges(features, self._com(effects.states))
         values = edges.values.flatten(0, 2)
@@ -189,7 +192,9 @@ class OneShotPredictor(EffectPredictor):
         outputs = self._outputs(features, edges)
         time = torch.randperm(effects.states.shape[1], device=self.device)[:SAMPLES_PER_STEP]
         chosen = effects.outcomes[None, :, None, None, None].expand(*outputs.logits.shape[:4], 1)
-        weights = outputs.weights.gather(4, chosen[..., None].expand(*chosen.shape, outputs.weights.shape[-1]))
+        weights = outputs.weights.gather(
+            4, chosen[..., None].expand(*chosen.shape, outputs.weights.shape[-1])
+        )
         motion = (weights[..., 0, :] @ self.motions[:, time].flatten(1)).unflatten(-1, (-1, COORDINATES))
         # The motion at rest; its states were normalised and shifted, so the first sample has to come along.
         states = torch.cat([effects.states[:, :1], effects.states[:, time]], dim=1)
@@ -205,7 +210,9 @@ class OneShotPredictor(EffectPredictor):
         share = likelihood.softmax(dim=-1).detach()
         off = (error / scale).detach().clamp(min=1e-6)
         scale_loss = (share * (expected + off * torch.exp(-expected))).sum(dim=-1)
-        compared = valid.any(dim=-1).float()[:, None]  # of a short trajectory there may be no sample among them
+        compared = valid.any(dim=-1).float()[
+            :, None
+        ]  # of a short trajectory there may be no sample among them
         loss = SCALE_WEIGHT * scale_loss - TEMPERATURE / scale * likelihood.logsumexp(dim=-1)
         return (loss * compared).mean() / compared.mean().clamp(min=1e-6)
 
@@ -314,7 +321,9 @@ class OneShotPredictor(EffectPredictor):
         sizes = self.motions[..., :3].square().sum(dim=2).mean(dim=1)
         # Many lever-ups network by network: all at once would not fit into the processor's cache.
         many = torch.is_inference_mode_enabled() and len(com) >= MANY
-        parts = [part * signs[:, None, None] for part in outputs.weights.split(1 if many else len(outputs.weights))]
+        parts = [
+            part * signs[:, None, None] for part in outputs.weights.split(1 if many else len(outputs.weights))
+        ]
         mean = torch.stack([part.mean(dim=(0, 2)) for part in parts]).mean(dim=0)
         distances = [((part - mean[:, None]).square() @ sizes).mean(dim=(0, 2)) for part in parts]
         apart = torch.stack(distances).mean(dim=0)

@@ -1,6 +1,6 @@
 """Candidate pivot edges of an object, and lever-ups described relative to them.
 
-A lifted object turns about an edge of its footprint, nearly as on a hinge. Relative to that edge, lever-ups of different
+A lifted object turns about an edge of its footprint, nearly as on a hinge. Relative to it, lever-ups of different
 objects look alike: what matters is how far contact and centre of mass are from it, and which way the blade pushes. All
 of it is in closed form from the hull's corners and the centre of mass.
 """

@@ -16,7 +16,15 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from foretrace.errors import DatasetError, TrainingError
-from foretrace.files import as_json, first_difference, read_json, short_hash, versions_of, write_json, write_text
+from foretrace.files import (
+    as_json,
+    first_difference,
+    read_json,
+    short_hash,
+    versions_of,
+    write_json,
+    write_text,
+)
 from foretrace.imagined.context import column_of
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split
@@ -113,8 +121,8 @@ class RunFolder:
         if difference := first_difference(there, config):
             name, found, wanted = difference
             raise TrainingError(
-                f"{self.path} holds a training with {name} = {found!r}, not {wanted!r}: choose another folder, the same "
-                "configuration, or start afresh"
+                f"{self.path} holds a training with {name} = {found!r}, not {wanted!r}: choose another folder, the "
+                "same configuration, or start afresh"
             )
 
     @property
@@ -128,7 +136,10 @@ class RunFolder:
 
     def write_environment(self, facts: Mapping[str, Any]) -> None:
         """Note what the training runs on."""
-        versions = {"python": platform.python_version(), **versions_of("foretrace", "numpy", "safetensors", "torch")}
+        versions = {
+            "python": platform.python_version(),
+            **versions_of("foretrace", "numpy", "safetensors", "torch"),
+        }
         write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": versions})
 
     def write_split(self, batch: InteractionBatch, split: Split) -> None:

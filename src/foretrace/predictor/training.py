@@ -315,9 +315,7 @@ class _Training:
         }
 
 
-def _loop_settings(
-    predictor: PredictorConfig | EffectPredictor, training: TrainConfig | None
-) -> TrainConfig:
+def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: TrainConfig | None) -> TrainConfig:
     for name, value, kinds in (
         ("predictor", predictor, (PredictorConfig, EffectPredictor)),
         ("training", training, (TrainConfig, type(None))),

@@ -74,10 +74,7 @@ class Check:
 
 
 def check_path(
-    path: ArmPath,
-    postures: Sequence[Posture],
-    T_table_base: Float[np.ndarray, "4 4"],
-    limits: ArmLimits,
+    path: ArmPath, postures: Sequence[Posture], T_table_base: Float[np.ndarray, "4 4"], limits: ArmLimits
 ) -> list[Check]:
     """The worst moments of one leg.
 

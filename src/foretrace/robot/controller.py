@@ -48,29 +48,39 @@ VARIABLES = [
 ]
 RUNNING, NORMAL, PLAYING = 7, 1, 2
 """Robot mode, safety mode and program state in which the arm moves."""
-SAFETY_MODES = {
-    1: "normal",
-    2: "reduced",
-    3: "protective stop",
-    4: "recovery",
-    5: "safeguard stop",
-    6: "system emergency stop",
-    7: "robot emergency stop",
-    8: "violation",
-    9: "fault",
-}
-ROBOT_MODES = {
-    -1: "no controller",
-    0: "disconnected",
-    1: "confirm safety",
-    2: "booting",
-    3: "power off",
-    4: "power on",
-    5: "idle",
-    6: "backdrive",
-    7: "running",
-    8: "updating firmware",
-}
+SAFETY_MODES = dict(
+    enumerate(
+        [
+            "normal",
+            "reduced",
+            "protective stop",
+            "recovery",
+            "safeguard stop",
+            "system emergency stop",
+            "robot emergency stop",
+            "violation",
+            "fault",
+        ],
+        start=1,
+    )
+)
+ROBOT_MODES = dict(
+    enumerate(
+        [
+            "no controller",
+            "disconnected",
+            "confirm safety",
+            "booting",
+            "power off",
+            "power on",
+            "idle",
+            "backdrive",
+            "running",
+            "updating firmware",
+        ],
+        start=-1,
+    )
+)
 
 
 @dataclass(frozen=True)

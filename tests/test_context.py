@@ -1,6 +1,6 @@
 import json
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,25 +8,26 @@ import torch
 from safetensors.torch import load_file
 
 from factories import fake_batch
-from foretrace.actions import Stroke, ToolPath
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.cli import main
 from foretrace.cli.prediction import _given_context
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
-from foretrace.experiments.paper_protocol import Recipe
+from foretrace.imagined.context import PARAMETERS, nominal_parameters, true_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
 from foretrace.interactions.topdown import TopDownView
-from foretrace.predictor import TrainConfig, load_predictor, train_predictor
+from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, train_predictor
 from foretrace.predictor.checkpoint import read_config
-from foretrace.predictor.context import PARAMETERS, true_values
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.training import fit_predictor
 
 NAMES = ("friction", "density")
-CONFIG = TrainConfig(features="none", hidden=16, epochs=3, min_steps=1, split=None, window=6, device="cpu")
-KNOWING = replace(CONFIG, known=NAMES)
+CONFIG = LstmConfig(features="none", hidden=16, window=6)
+CONDITIONED = replace(CONFIG, context=NAMES)
+TRAINING = TrainConfig(epochs=3, min_steps=1, split=None, device="cpu")
+LONGER = replace(TRAINING, epochs=40)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,7 +37,7 @@ def _one_thread():
 
 @pytest.fixture(scope="module")
 def batch() -> InteractionBatch:
-    """Objects lift the less the higher the friction: only who knows it can tell."""
+    """Objects lift the less the higher the friction."""
     rng = np.random.default_rng(7)
     made = fake_batch(rng, 40, num_samples=20)
     friction, density = rng.uniform(0.4, 1.2, 40), rng.uniform(300, 1200, 40)
@@ -47,14 +48,16 @@ def batch() -> InteractionBatch:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, batch):
-    return train_predictor(batch, KNOWING, tmp_path_factory.mktemp("known") / "run", progress=False)
+    return train_predictor(
+        batch, CONDITIONED, tmp_path_factory.mktemp("context") / "run", TRAINING, progress=False
+    )
 
 
 def view_of(batch: InteractionBatch, k: int) -> TopDownView:
     return TopDownView(batch.mask[k], batch.height[k])
 
 
-def test_what_is_known_is_standardised_by_the_training_part(run, batch):
+def test_the_context_is_standardised_by_the_training_part(run, batch):
     tensors = load_file(run / "model.safetensors")
     train = json.loads((run / "split.json").read_text())["train"]  # ids are row numbers here
     for k, name in enumerate(NAMES):
@@ -63,125 +66,127 @@ def test_what_is_known_is_standardised_by_the_training_part(run, batch):
         assert tensors["known_scale"][k] == pytest.approx(values.std())
     predictor = load_predictor(run)
     values = np.stack([batch.friction, batch.density], axis=1)[train]
-    inputs = predictor.add_known(torch.zeros(len(values), 0), values)
+    inputs = predictor.add_context(torch.zeros(len(values), 0), values)
     torch.testing.assert_close(inputs.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
     torch.testing.assert_close(inputs.std(0, correction=0), torch.ones(2))
 
 
 def test_constants_that_never_vary_are_only_shifted(batch):
     same = replace(batch, friction=np.full(40, 0.8), density=np.full(40, 600.0))
-    predictor, _ = fit_predictor(same, KNOWING, split_by_seed(40, 0, None))
+    predictor, _ = fit_predictor(same, CONDITIONED, split_by_seed(40, 0, None), TRAINING)
     assert predictor.known_scale.tolist() == [1.0, 1.0]
     assert np.isfinite(predictor.imagine_batch(same).com).all()
 
 
 def test_a_saved_predictor_imagines_the_same_alone_and_in_a_batch(run, batch):
     predictor = load_predictor(run)
-    assert predictor.known == NAMES
+    assert predictor.context == NAMES
     whole = predictor.imagine_batch(batch).com
     for k in (0, 17):
-        known = {"friction": float(batch.friction[k]), "density": float(batch.density[k])}
-        alone = predictor.imagine(view_of(batch, k), batch.com[k, 0], known)
+        context = {"friction": float(batch.friction[k]), "density": float(batch.density[k])}
+        alone = predictor.imagine(view_of(batch, k), context=context, com=batch.com[k, 0])
         np.testing.assert_allclose(alone.com_trajectory, whole[k], atol=1e-6)
-    other = predictor.imagine(view_of(batch, 0), batch.com[0, 0], {"friction": 0.1, "density": 600.0})
+    context = {"friction": 0.1, "density": 600.0}
+    other = predictor.imagine(view_of(batch, 0), context=context, com=batch.com[0, 0])
     assert np.abs(other.com_trajectory - whole[0]).max() > 1e-5
 
 
-def test_knowing_helps_where_it_decides(batch):
+def test_context_helps_where_it_decides(batch):
     """Without a feature that tells them apart, only friction explains how far objects are lifted."""
     split = split_by_seed(40, 0, None)
     errors = {}
-    for known in ((), ("friction",)):
-        config = replace(CONFIG, known=known, hidden=32, epochs=40)
-        predictor, _ = fit_predictor(batch, config, split)
+    for context in ((), ("friction",)):
+        config = replace(CONFIG, context=context, hidden=32)
+        predictor, _ = fit_predictor(batch, config, split, LONGER)
         inputs = predictor.features.inputs(batch)
-        errors[known] = measure_errors(predictor, batch[split.train], inputs[split.train])["full"]
+        errors[context] = measure_errors(predictor, batch[split.train], inputs[split.train])["full"]
     assert errors[("friction",)] < 0.9 * errors[()]
 
 
 def test_an_interrupted_training_goes_on_and_another_one_is_refused(tmp_path, run, batch):
     folder = tmp_path / "run"
     shutil.copytree(run, folder)
-    train_predictor(batch, KNOWING, folder, progress=False)
-    with pytest.raises(TrainingError, match=r"settings\.known = \['friction', 'density'\], not None"):
-        train_predictor(batch, CONFIG, folder, progress=False)
+    train_predictor(batch, CONDITIONED, folder, TRAINING, progress=False)
+    with pytest.raises(TrainingError, match=r"config\.context = \['friction', 'density'\], not \[\]"):
+        train_predictor(batch, CONFIG, folder, TRAINING, progress=False)
     assert fingerprint(batch, NAMES) != fingerprint(batch)
     heavier = replace(batch, density=2 * batch.density)
     assert fingerprint(heavier) == fingerprint(batch)
     with pytest.raises(TrainingError, match=r"training\.data"):
-        train_predictor(heavier, KNOWING, folder, progress=False)
+        train_predictor(heavier, CONDITIONED, folder, TRAINING, progress=False)
 
 
-def test_who_knows_nothing_is_written_as_before(tmp_path, batch):
-    run = train_predictor(batch, CONFIG, tmp_path / "run", progress=False)
-    config = read_config(run)
-    assert "known" not in config["settings"]
-    assert "known" not in config["training"]
+def test_without_context_there_are_no_tensors_for_it(tmp_path, batch):
+    run = train_predictor(batch, CONFIG, tmp_path / "run", TRAINING, progress=False)
+    assert read_config(run)["config"]["context"] == []
     assert not [name for name in load_file(run / "model.safetensors") if "known" in name]
-    assert load_predictor(run).known == ()
-    assert "known" not in Recipe().describe()
-    assert Recipe(KNOWING).describe()["known"] == NAMES
+    assert load_predictor(run).context == ()
 
 
 # --- bad input ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("known", "message"),
+    ("context", "message"),
     [
         (
             None,
-            r"has to know friction, density: give known=\{'friction': value of object and table, 'density'",
+            r"is conditioned on friction, density: give context=\{'friction': value of object and table, 'density'",
         ),
-        ({"friction": 0.8}, "has to know density: give known="),
-        ({"friction": 0.8, "density": float("nan")}, r"known density is nan: give a finite value in kg/m\^3"),
+        ({"friction": 0.8}, "is conditioned on density: give context="),
+        (
+            {"friction": 0.8, "density": float("nan")},
+            r"context density is nan: give a finite value in kg/m\^3",
+        ),
         (
             {"friction": 0.8, "density": 600.0, "colour": 3.0},
-            "knows friction, density, not 'colour': leave it out",
+            "friction, density, not on 'colour': leave it out",
         ),
     ],
 )
-def test_what_is_missing_unknown_or_not_finite_is_refused(run, batch, known, message):
+def test_missing_unknown_or_infinite_context_is_refused(run, batch, context, message):
+    predictor = load_predictor(run)
     with pytest.raises(PredictionError, match=message):
-        load_predictor(run).imagine(view_of(batch, 0), known=known)
+        predictor.imagine(view_of(batch, 0), context=context)
+    with pytest.raises(PredictionError, match=f"candidate 0: .*{message}"):
+        predictor.imagine_candidates(view_of(batch, 0), [LeverUp((0, 0), (1, 0))], context=context)
 
 
-def test_values_for_a_predictor_that_knows_nothing_are_refused(batch):
-    predictor = CONFIG.make_predictor(20)
-    with pytest.raises(PredictionError, match="knows nothing but the view, not 'friction'"):
-        predictor.imagine(view_of(batch, 0), known={"friction": 0.8})
+def test_context_for_a_predictor_without_any_is_refused(batch):
+    with pytest.raises(PredictionError, match="conditioned on nothing but the view, not on 'friction'"):
+        CONFIG.make(20).imagine(view_of(batch, 0), context={"friction": 0.8})
 
 
 def test_interactions_without_a_record_are_named(run, batch):
     unknown = replace(batch, density=np.where(batch.ids == 11, np.nan, batch.density))
     message = (
-        "interaction 11 has density = nan: record its density, leave it out, or use a predictor that does not"
+        "interaction 11 has density = nan: record its density, leave it out, or use a predictor that is not"
     )
     with pytest.raises(PredictionError, match=message):
         load_predictor(run).imagine_batch(unknown)
     with pytest.raises(PredictionError, match=message):
-        fit_predictor(unknown, KNOWING, split_by_seed(40, 0, None))
-    fit_predictor(unknown, replace(CONFIG, epochs=1), split_by_seed(40, 0, None))
+        fit_predictor(unknown, CONDITIONED, split_by_seed(40, 0, None), TRAINING)
+    fit_predictor(unknown, CONFIG, split_by_seed(40, 0, None), replace(TRAINING, epochs=1))
 
 
 @pytest.mark.parametrize(
-    ("known", "message"),
-    [(("mass",), "'mass' cannot be known .* choose from friction"), (("density", "density"), "named twice")],
+    ("context", "message"),
+    [(("mass",), "'mass' is no context .* choose from friction"), (("density", "density"), "named twice")],
 )
-def test_impossible_names_are_refused(known, message):
+def test_impossible_names_are_refused(context, message):
     with pytest.raises(TrainingError, match=message):
-        TrainConfig(known=known)
+        LstmConfig(context=context)
 
 
-def test_a_checkpoint_that_knows_nonsense_is_refused(tmp_path, run):
+def test_a_checkpoint_with_nonsense_for_context_is_refused(tmp_path, run):
     folder = tmp_path / "run"
     shutil.copytree(run, folder)
     config = json.loads((folder / "config.json").read_text())
-    config["settings"]["known"] = ["friction", "mass"]
+    config["config"]["context"] = ["friction", "mass"]
     (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(CheckpointError, match="'mass' cannot be known"):
+    with pytest.raises(CheckpointError, match="'mass' is no context"):
         load_predictor(folder)
-    del config["settings"]["known"]
+    config["config"]["context"] = []
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(CheckpointError, match="unexpected tensors known_mean, known_scale"):
         load_predictor(folder)
@@ -190,9 +195,9 @@ def test_a_checkpoint_that_knows_nonsense_is_refused(tmp_path, run):
 @pytest.mark.parametrize(
     ("given", "knows", "simulated", "message"),
     [
-        ({"friction": None}, ("friction",), False, "has to know friction: give --friction"),
+        ({"friction": None}, ("friction",), False, "is conditioned on friction: give --friction"),
         ({"tool_friction": 0.0}, ("tool_friction",), False, "--tool-friction is 0.0: give a number above 0"),
-        ({"density": 600.0}, (), False, "does not know density: leave --density out"),
+        ({"density": 600.0}, (), False, "is not conditioned on density: leave --density out"),
     ],
 )
 def test_options_of_predict_are_checked(given, knows, simulated, message):
@@ -201,36 +206,39 @@ def test_options_of_predict_are_checked(given, knows, simulated, message):
     assert _given_context({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
 
 
-def test_the_actions_parameters_are_told_as_constants_are(batch):
-    assert set(PARAMETERS) == set(asdict(Stroke()))
+def test_the_actions_parameters_are_context_as_constants_are(batch):
+    assert set(PARAMETERS) == set(nominal_parameters())
     rng = np.random.default_rng(3)
     sweep = rng.uniform(0.4, 1.0, 40)
     rest = batch.com[:, :1]
     farther = replace(batch, sweep=sweep, com=rest + (batch.com - rest) * sweep[:, None, None])
-    config = replace(KNOWING, known=("sweep", "speed"), hidden=32, epochs=40)
+    config = replace(CONFIG, context=("sweep", "speed"), hidden=32)
     split = split_by_seed(40, 0, None)
-    predictor, _ = fit_predictor(farther, config, split)
+    predictor, _ = fit_predictor(farther, config, split, LONGER)
     low, high = (
-        predictor.imagine(view_of(batch, 0), batch.com[0, 0], {"sweep": value, "speed": 1.0}).com_trajectory
+        predictor.imagine(
+            view_of(batch, 0), context={"sweep": value, "speed": 1.0}, com=batch.com[0, 0]
+        ).com_trajectory
         for value in (0.45, 0.95)
     )
     way = [np.linalg.norm(path[-1] - path[0]) for path in (low, high)]
     assert way[1] > 1.3 * way[0]
     with pytest.raises(
-        PredictionError, match=r"has to know speed: give known=\{'sweep': value in rad, 'speed': value"
+        PredictionError,
+        match=r"is conditioned on speed: give context=\{'sweep': value in rad, 'speed': value",
     ):
-        predictor.imagine(view_of(batch, 0), known={"sweep": 0.5})
+        predictor.imagine(view_of(batch, 0), context={"sweep": 0.5})
 
 
-def test_predict_is_told_of_the_action_and_compares_with_it(tmp_path, batch, capsys):
+def test_predict_is_conditioned_on_the_action_and_compares_with_it(tmp_path, batch, capsys):
     sweep = np.random.default_rng(3).uniform(0.4, 1.0, 40)
-    config = replace(KNOWING, known=("sweep",))
-    run = train_predictor(replace(batch, sweep=sweep), config, tmp_path / "run", progress=False)
+    config = replace(CONFIG, context=("sweep",))
+    run = train_predictor(replace(batch, sweep=sweep), config, tmp_path / "run", TRAINING, progress=False)
     polygon = tmp_path / "polygon.txt"
     polygon.write_text("0.1 0\n0.02 0.09\n-0.08 0.05\n-0.07 -0.06\n0.04 -0.09\n")
     command = ["predict", str(run), "--polygon", str(polygon), "--edge", "1", "--compare", "--no-animation"]
     assert main(command) == 2
-    assert "has to know sweep: give --sweep" in capsys.readouterr().err
+    assert "is conditioned on sweep: give --sweep" in capsys.readouterr().err
     rises = {}
     for told in (0.45, 0.95):
         out = tmp_path / f"{told}"
@@ -246,8 +254,8 @@ def test_predict_is_told_of_the_action_and_compares_with_it(tmp_path, batch, cap
     assert rises[0.95][1] > 1.5 * rises[0.45][1]
 
 
-def test_true_values_are_those_of_physics_and_stroke():
+def test_true_context_is_that_of_physics_and_path():
     names = ("sweep", "friction", "insertion")
-    found = true_values(Physics(friction=0.6), names, Stroke(insertion=0.03))
+    found = true_context(Physics(friction=0.6), names, nominal_parameters() | {"insertion": 0.03})
     assert found == {"sweep": ToolPath.sweep, "friction": 0.6, "insertion": 0.03}
     assert list(found) == list(names)
