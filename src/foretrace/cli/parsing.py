@@ -7,7 +7,7 @@ from docstrings. What all commands have in common is decided here: how options l
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 Ready = Callable[[], int | None]
 """A command with its options; returns the exit status."""
-LEFT_OUT = "left_out"
-"""Attribute of a function: fields of dataclasses among its parameters that are no options, by class."""
+ADAPTATIONS = "adaptations"
+"""Attribute of a function: how fields of dataclasses among its parameters differ from its options."""
 T = TypeVar("T", bound=Callable[..., Any])
 
 
@@ -68,15 +68,26 @@ Entry = Command | Group | Callable[..., int | None]
 """A function, or one that is imported later, or several."""
 
 
-def without(fields: Mapping[type, Sequence[str]]) -> Callable[[T], T]:
-    """Mark a command whose dataclasses have fields that are no options of it.
+@dataclass(frozen=True)
+class Adaptations:
+    """How fields of dataclasses differ from the options of a command."""
+
+    left_out: Mapping[type, Sequence[str]] = field(default_factory=dict)
+    """Fields that are no options, by class; they keep their defaults."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Names of options by those of fields."""
+
+
+def adapt(*left_out: tuple[type, Sequence[str]], **renamed: str) -> Callable[[T], T]:
+    """Mark a command whose options differ from the fields of its dataclasses.
 
     Args:
-        fields: Names of these fields by class; they keep their defaults.
+        *left_out: Classes, each with names of its fields that are no options; they keep their defaults.
+        **renamed: Names of options by those of fields.
     """
 
     def mark(command: T) -> T:
-        setattr(command, LEFT_OUT, fields)
+        setattr(command, ADAPTATIONS, Adaptations(dict(left_out), renamed))
         return command
 
     return mark
@@ -121,7 +132,7 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
         prog=program,
         description=_wrap(_clean(documentation.split("\nArgs:\n")[0].strip())),
         args=list(words),
-        registry=_registry(getattr(command, LEFT_OUT, {})),
+        registry=_registry(getattr(command, ADAPTATIONS, Adaptations())),
         config=(
             tyro.conf.DisallowNone,
             tyro.conf.FlagCreatePairsOff,
@@ -153,13 +164,17 @@ def _suggest(name: str, entries: Mapping[str, Entry]) -> str:
     return f"choose from {', '.join(entries)}"
 
 
-def _registry(left_out: Mapping[type, Sequence[str]]) -> "ConstructorRegistry":
+def _registry(adaptations: Adaptations) -> "ConstructorRegistry":
     """How tyro takes functions and dataclasses apart."""
     import tyro
     from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo, StructConstructorSpec
 
     registry, inside = ConstructorRegistry(), []
     hint = tyro.conf.arg(help_behavior_hint=_hint)
+
+    def adapted(field: Any) -> Any:
+        name = tyro.conf.arg(name=adaptations.renamed.get(field.name))
+        return replace(field, type=Annotated[field.type, hint, name], helptext=partial(_help, field.helptext))
 
     @registry.primitive_rule
     def optional(info: "PrimitiveTypeInfo") -> Any:
@@ -191,13 +206,8 @@ def _registry(left_out: Mapping[type, Sequence[str]]) -> "ConstructorRegistry":
                 inside.pop()
         if not isinstance(spec, StructConstructorSpec):
             return None
-        hidden = left_out.get(info.type, ())
-        fields = tuple(
-            replace(field, type=Annotated[field.type, hint], helptext=partial(_help, field.helptext))
-            for field in spec.fields
-            if field.name not in hidden
-        )
-        return replace(spec, fields=fields)
+        hidden = adaptations.left_out.get(info.type, ())
+        return replace(spec, fields=tuple(adapted(each) for each in spec.fields if each.name not in hidden))
 
     return registry
 
@@ -210,7 +220,7 @@ def _take_apart(function: Callable[..., Any]) -> Any:
 
     hints = get_type_hints(function, include_extras=True)
     entries = docstring_parser.parse(inspect.getdoc(function) or "").params
-    help = {entry.arg_name: " ".join((entry.description or "").split()) for entry in entries}
+    help = {entry.arg_name: entry.description for entry in entries}
     fields = [
         StructFieldSpec(
             name,
@@ -230,7 +240,7 @@ def _hint(default: str) -> str:
 
 def _help(text: str | Callable[[], str | None] | None) -> str | None:
     text = text() if callable(text) else text
-    return None if text is None else _clean(text)
+    return None if text is None else _clean(" ".join(text.split()))
 
 
 def _clean(text: str) -> str:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from foretrace.cli.parsing import without
-from foretrace.errors import ActionError, PredictionError
+from foretrace.cli.contact import ContactOptions
+from foretrace.cli.parsing import adapt
+from foretrace.errors import PredictionError
 from foretrace.imagined.context import CONSTANTS, CONTEXT, PARAMETERS
 from foretrace.perception.photo import PhotoConfig
 
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from foretrace.objects import ObjectModel
     from foretrace.perception.photo import PhotoView
     from foretrace.predictor import ImaginedEffect
-
-LARGEST_SNAP = 0.02
-"""A contact point farther from the outline is a mistake and is not moved there [m]."""
 
 
 @dataclass(frozen=True)
@@ -71,43 +69,6 @@ class ObjectOptions:
 
 
 @dataclass(frozen=True)
-class ContactOptions:
-    """The contact."""
-
-    edge: int | None = None
-    """Number of the outline's edge to lever at; edge k runs from corner k to corner k + 1."""
-    fraction: float | None = None
-    """Share of that edge before the contact, between 0 and 1; 0.5 by default."""
-    contact: tuple[float, float] | None = None
-    """Point to lever at instead, in the object's frame [m]; moved to the outline, at most 2 cm away. An image's frame
-    has its origin at the silhouette's centroid, x to the right and y up."""
-
-    def place(self, obj: "ObjectModel") -> "LeverUp":
-        """The lever-up of an object.
-
-        Raises:
-            PredictionError: Options do not go together.
-            ActionError: There is no such edge, or the point is too far from the outline.
-        """
-        from foretrace.actions import LeverUp
-
-        if (self.edge is None) == (self.contact is None):
-            raise PredictionError("give either --edge (with --fraction) or --contact X Y")
-        if self.edge is not None:
-            return LeverUp.at_edge(obj, self.edge, 0.5 if self.fraction is None else self.fraction)
-        if self.fraction is not None:
-            raise PredictionError("--fraction goes with --edge: leave it out")
-        assert self.contact is not None
-        action = LeverUp.nearest(obj, self.contact)
-        gap = float(np.linalg.norm(action.contact - self.contact))
-        if gap > LARGEST_SNAP:
-            raise ActionError(
-                f"contact {self.contact} lies {gap:.3f} m from the outline: choose a point within {LARGEST_SNAP} m of it"
-            )
-        return action
-
-
-@dataclass(frozen=True)
 class PhotoOptions:
     """A photograph of the object on a table, in place of object and contact; the prediction is drawn onto it."""
 
@@ -124,7 +85,7 @@ class PhotoOptions:
     measures the object's height, unless --height is given."""
     background: Path | None = None
     """Photograph of the table without the object."""
-    found: PhotoConfig = PhotoConfig()
+    found: PhotoConfig = field(default_factory=PhotoConfig)
     """How the object is found."""
 
     def given(self) -> list[str]:
@@ -167,7 +128,7 @@ ContextOptions = make_dataclass(
 """One option for everything that a predictor may be conditioned on."""
 
 
-@without({PhotoConfig: ("height",)})
+@adapt((PhotoConfig, ("height",)))
 def predict(
     obj: Annotated[OmitArgPrefixes[ObjectOptions], arg(name="object")],
     at: Annotated[OmitArgPrefixes[ContactOptions], arg(name="contact")],

@@ -6,15 +6,15 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, arg
 
 from foretrace.cli.console import print_outcomes, say
-from foretrace.cli.parsing import without
+from foretrace.cli.parsing import adapt
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
 ROLLING_TIME = 1.5
-"""Time for which solids are observed after the blade has stopped [s]: by then most have rolled more than their length."""
+"""Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
 
 
-@without({CollectConfig: ("randomisation", "tool"), SimulationConfig: ("watch_time", "tool")})
+@adapt((CollectConfig, ("randomisation", "tool")), (SimulationConfig, ("watch_time", "tool")))
 def simulate(
     out: Path,
     config: Annotated[OmitArgPrefixes[CollectConfig], arg(name="")],

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from foretrace import predictor as learned
 from foretrace.cli.console import say
-from foretrace.cli.parsing import without
+from foretrace.cli.parsing import adapt
 from foretrace.features import FEATURES, FeatureExtractor
 from foretrace.files import write_text
 from foretrace.interactions.dataset import Dataset
@@ -40,7 +40,7 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
     features = FEATURES.find(_value("--features", words) or config_class().features)
     shared = [each.name for each in fields(TrainConfig) if each.name in settings]
 
-    @without({config_class: ("feature_options",), TrainConfig: ("split", *shared)})
+    @adapt((config_class, ("feature_options",)), (TrainConfig, ("split", *shared)))
     def train(
         *,
         data: Path,
