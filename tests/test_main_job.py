@@ -21,9 +21,10 @@ from foretrace.pictures import animation
 from foretrace.predictor import ImaginedBatch
 
 ROOT = Path(__file__).parents[1]
-SMALL_TRAINING = (
-    "train --features im-cnn --epochs 2 --min-steps 1 --hidden 8 --device cpu --threads 1".split()
-)
+SMALL_TRAINING = [
+    *("train", "--features", "im-cnn", "--hidden", "8", "--epochs", "2", "--min-steps", "1"),
+    *("--device", "cpu", "--threads", "1"),
+]
 
 
 @pytest.fixture(scope="module")

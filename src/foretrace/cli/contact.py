@@ -24,8 +24,8 @@ class ContactOptions:
     fraction: float | None = None
     """Share of that edge before the contact, between 0 and 1; 0.5 by default."""
     contact: tuple[float, float] | None = None
-    """Point to lever at instead, in the object's frame [m]; moved to the outline. An image's frame has its origin at the
-    silhouette's centroid, x to the right and y up."""
+    """Point to lever at instead, in the object's frame [m]; moved to the outline. An image's frame has its origin at
+    the silhouette's centroid, x to the right and y up."""
 
     @property
     def share(self) -> tuple[int, float] | None:

@@ -127,8 +127,8 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
     import tyro
 
     documentation = inspect.getdoc(command) or ""
-    return tyro.cli(
-        command,  # pyright: ignore[reportArgumentType]
+    ready: Any = tyro.cli(
+        command,
         prog=program,
         description=_wrap(_clean(documentation.split("\nArgs:\n")[0].strip())),
         args=list(words),
@@ -140,6 +140,7 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
             tyro.conf.PositionalMetavarFromFieldName,
         ),
     )
+    return ready
 
 
 def _list(entries: Mapping[str, Entry], program: str, about: str, status: int) -> int:
@@ -167,7 +168,12 @@ def _suggest(name: str, entries: Mapping[str, Entry]) -> str:
 def _registry(adaptations: Adaptations) -> "ConstructorRegistry":
     """How tyro takes functions and dataclasses apart."""
     import tyro
-    from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo, StructConstructorSpec
+    from tyro.constructors import (
+        ConstructorRegistry,
+        PrimitiveConstructorSpec,
+        PrimitiveTypeInfo,
+        StructConstructorSpec,
+    )
 
     registry, inside = ConstructorRegistry(), []
     hint = tyro.conf.arg(help_behavior_hint=_hint)
@@ -183,7 +189,7 @@ def _registry(adaptations: Adaptations) -> "ConstructorRegistry":
         if len(kinds) != 1 or type(None) not in get_args(info.type):
             return None
         spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
-        if not hasattr(spec, "instance_from_str"):
+        if not isinstance(spec, PrimitiveConstructorSpec):
             return None  # tyro's own rules are for what is no primitive
         return replace(
             spec,

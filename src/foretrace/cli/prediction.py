@@ -155,6 +155,7 @@ def predict(
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
     """
     from foretrace.cli.futures import outlook_of, radius_of, say_futures
+    from foretrace.interactions.recording_folder import write_image
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import Scene, scene_figure
     from foretrace.predictor import load_predictor
@@ -185,7 +186,7 @@ def predict(
     _write_trajectory(out, run, object, action, imagined, truth)
     scene_figure(scene).savefig(out / "prediction.png")
     if seen is not None:
-        seen.save_overlay(out / "overlay.png", imagined.com_trajectory, radius_of(imagined))
+        write_image(out / "overlay.png", seen.overlay(imagined.com_trajectory, radius_of(imagined)))
     if animation:
         scene_animation(scene, out / "prediction.gif")
     if truth is not None:

@@ -66,9 +66,7 @@ def import_recording(
         raise PerceptionError(f"{recording} has no {MARKERS} beside it: give --markers")
     where = Contact(at.contact, contact_px, at.share)
     shape = None if object is None else read_shape(object, config.height)
-    found = importing.import_recording(
-        opened, taken_by, MarkerLayout.load(layout), where, shape, replace(config, height=height)
-    )
+    found = importing.import_recording(opened, taken_by, MarkerLayout.load(layout), where, shape, config)
     id = add_recorded(out, found.interaction, _notes(recording, taken_by, found))
     effect, track = found.interaction.effect, found.track
     missing = int((~track.seen).sum())
