@@ -28,7 +28,7 @@ def effects(simulation: SimulationConfig, every: int) -> list[Effect]:
 
 def compare(first: list[Effect], second: list[Effect]) -> dict[str, float]:
     pairs = list(zip(first, second, strict=True))
-    both = [(a, b) for a, b in pairs if a.outcome is b.outcome is Outcome.LEVERED]
+    both = [(a, b) for a, b in pairs if a.outcome == b.outcome == Outcome.LEVERED]
     apart = [1e3 * np.linalg.norm(a.com_trajectory - b.com_trajectory, axis=1).mean() for a, b in both]
     return {
         "trials": len(pairs),

@@ -21,22 +21,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, Motion, ToolPath
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle, transform_points
 from foretrace.interactions.dataset import Dataset
-from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
-from foretrace.perception import masks
 from foretrace.perception.calibration import Board, calibrate, read_images
 from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_recording
 from foretrace.perception.markers import MarkerLayout, detect_markers
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
+from foretrace.perception.photo import MaskMethod, PhotoConfig, observe_photo
 from foretrace.perception.recordings import open_recording
-from foretrace.perception.views import Observation, PlacedObject, contact_at_pixel, observe, place_object
+from foretrace.perception.views import Observation, PlacedObject
 from foretrace.predictor import load_predictor
 from foretrace.simulation.lens import WEBCAM
 from foretrace.simulation.recording import RecordingConfig, photograph_board, record_lever_up
@@ -84,7 +83,7 @@ def make_still(folder: Path, number: int, **condition) -> None:
     """One frame, before the blade moves."""
     if not (folder / "truth.json").is_file():
         config = replace(film_config(number), depth_every=1, **condition)
-        short = 1.5 / config.frames_per_second - config.lead_time - config.simulation.path.duration
+        short = 1.5 / config.frames_per_second - config.lead_time - ToolPath().duration
         record_lever_up(*subject(number), folder, replace(config, tail_time=short), seed=number)
 
 
@@ -184,26 +183,20 @@ def sight_of(
     T_table_camera: np.ndarray,
     camera: PinholeCamera,
     pixel: tuple[float, float],
-    how: str,
+    how: MaskMethod,
     box: tuple[int, int, int, int] | None = None,
 ) -> Observation:
     """What the first frame alone shows of an object of unknown shape."""
     frame = next(open_recording(folder).frames())
-    if how == "depth":
-        assert frame.depth is not None
-        heights = masks.heights_above_table(frame.depth, camera, T_table_camera)
-        mask = masks.find_by_height(heights, pixel)
-        height, rim = masks.object_height(heights, mask), 0.008
-    elif how == "grabcut":
-        assert box is not None
-        mask = masks.pick_object(masks.mask_by_grabcut(frame.image, box), pixel)
-        height, rim = HEIGHT, 0.003
-    else:
-        background = read_image(folder / "background.png")
-        mask = masks.find_by_background(frame.image, background, pixel)
-        height, rim = HEIGHT, 0.003
-    placed = place_object(mask, camera, T_table_camera, height, rim, hull=True)
-    return observe(placed, contact_at_pixel(placed, pixel, camera, T_table_camera))
+    return observe_photo(
+        frame.image,
+        camera,
+        pixel,
+        T_table_camera=T_table_camera,
+        depth=frame.depth if how == "depth" else None,
+        background=read_image(folder / "background.png"),
+        config=PhotoConfig(how, box, None if how == "depth" else HEIGHT, hull=True),
+    )
 
 
 def overlap(a: TopDownView, b: TopDownView) -> float:
@@ -305,8 +298,9 @@ def judge_simulated(data: Path) -> dict:
     for row in chosen:
         interaction = dataset[row]
         effect = interaction.effect
-        told, _ = judge_motion(interaction.object, effect.pose_trajectory, effect.com_trajectory)
-        agree += told == effect.outcome
+        unseen = Motion(effect.times, effect.pose_trajectory, effect.tool_trajectory, effect.joint_trajectory)
+        judgement = interaction.action.judge(unseen, interaction.object, effect.com_trajectory)
+        agree += judgement.outcome == effect.outcome
         shift = np.linalg.norm(effect.com_trajectory - effect.com_trajectory[0], axis=1)
         k = int((shift > ONSET_SHIFT).argmax())
         onsets.append(np.interp(ONSET_SHIFT, shift[k - 1 : k + 1], effect.times[k - 1 : k + 1]))

@@ -18,13 +18,14 @@ from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.motions import ContactParameters
 from foretrace.interactions.record import Effect, Outcome
 from foretrace.objects.body import Body
-from foretrace.simulation import mujoco_engine, tool
+from foretrace.simulation import tool
 from foretrace.simulation.collect import CollectConfig, num_trials, trial
-from foretrace.simulation.engine import ENGINES
+from foretrace.simulation.engine import BUILT_IN
 from foretrace.simulation.free_motion import simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
 
 G = 9.81
+ENGINES = tuple(BUILT_IN)
 LYING = [0.0, 0.0, 0.03, float(np.sqrt(0.5)), float(np.sqrt(0.5)), 0.0, 0.0]
 """A cylinder of 3 cm radius on its side, axis along -y."""
 FLAT_BOX = Body.box((0.10, 0.08, 0.04), 0.3)
@@ -219,14 +220,12 @@ def distances(pairs: list[tuple[Effect, Effect]]) -> dict[str, float]:
 def play_without_touch_margin(ids: list[int]) -> list[Effect]:
     """MuJoCo's effects with a blade that acts where it touches, as Bullet's, and not from a millimetre away."""
     margin, tool.TOUCH_MARGIN = tool.TOUCH_MARGIN, 0.0
-    for cached in (make_engine, mujoco_engine.plan_control):
-        cached.cache_clear()
+    make_engine.cache_clear()
     try:
         return play("mujoco", ids)[0]
     finally:
         tool.TOUCH_MARGIN = margin
-        for cached in (make_engine, mujoco_engine.plan_control):
-            cached.cache_clear()
+        make_engine.cache_clear()
 
 
 def levered_in_both(pairs: list[tuple[Effect, Effect]]) -> list[tuple[Effect, Effect]]:

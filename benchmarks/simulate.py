@@ -16,7 +16,7 @@ from rich.console import Console
 from foretrace.geometry import matrix_to_pose
 from foretrace.simulation.collect import CollectConfig, collect, num_trials, trial
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.mujoco_engine import STATE, plan_control
+from foretrace.simulation.mujoco_engine import STATE, plan_arm, plan_carriage
 from foretrace.simulation.scene import build_scene
 
 OBJECTS = 16
@@ -25,11 +25,14 @@ OBJECTS = 16
 def time_raw(config: CollectConfig, ids: range) -> float:
     """Seconds that bare stepping takes for one object's trials, its model compiled before."""
     simulation = config.simulation
-    path = (simulation.path, simulation.tool, simulation.embodiment, simulation.timestep)
-    control = plan_control(*path, simulation.sample_period)
-    obj, _, _ = trial(config, ids[0])
-    spec = build_scene(obj, simulation.physics, simulation.tool, simulation.embodiment, simulation.timestep)
-    model = spec.compile()
+    obj, action, _ = trial(config, ids[0])
+    num_samples = round(action.duration / simulation.sample_period)
+    samples = action.tool_motion(np.arange(num_samples + 1) * simulation.sample_period)
+    steps = num_samples * round(simulation.sample_period / simulation.timestep)
+    plan = plan_arm if simulation.embodiment == "arm" else plan_carriage
+    control = plan(action.tool_motion, samples, action.tool, steps, simulation.timestep)
+    place = (simulation.embodiment, simulation.timestep, control.coordinates)
+    model = build_scene(obj, simulation.physics, action.tool, *place).compile()
     data, seconds = mujoco.MjData(model), 0.0
     for id in ids:
         mujoco.mj_resetData(model, data)

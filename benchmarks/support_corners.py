@@ -61,7 +61,7 @@ def agreement(rows: list[Comparison]) -> dict[str, float]:
     """Shares of trials that agree."""
     observed = np.array([row.observed == row.recorded for row in rows])
     rule = np.array([row.rule == row.recorded for row in rows])
-    levered = np.array([row.outcome is Outcome.LEVERED for row in rows])
+    levered = np.array([row.outcome == Outcome.LEVERED for row in rows])
     two = np.array([len(row.observed) == 2 for row in rows])
     return {
         "trials": len(rows),

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 
 import foretrace as ft
+from foretrace.actions import Screwdriver
 from foretrace.simulation.camera import make_renderer
 from foretrace.simulation.scene import build_scene
-from foretrace.simulation.tool import Tool
 
 HEIGHT, WIDTH = 420, 560
 
@@ -18,7 +18,7 @@ HEIGHT, WIDTH = 420, 560
 def main(out: Path) -> None:
     prism = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)])
     interaction = ft.simulate(prism, ft.LeverUp.at_edge(prism, edge=2, fraction=0.4))
-    spec = build_scene(prism, ft.Physics(), Tool(), "arm", timestep=0.002)
+    spec = build_scene(prism, ft.Physics(), Screwdriver(), "arm", timestep=0.002)
     sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
     spec.add_texture(name="sky", rgb1=[0.93, 0.95, 0.97], width=16, height=16, **sky)
     model = spec.compile()

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foretrace.actions import CORNER_MARGIN, USUAL_STROKE, LeverUp, Stroke, ToolPath, sample_contacts
+from foretrace.actions import CORNER_MARGIN, LeverUp, ToolPath, sample_contacts
 from foretrace.errors import ActionError
 from foretrace.geometry import inward_normals, transform_points
 from foretrace.objects import NO_BEVEL, Prism, sample_prism
@@ -125,33 +125,33 @@ def test_moved_actions():
     st.floats(0.1, 5.0),
     st.floats(0.0, 0.6),
 )
-def test_a_stroke_is_what_its_path_does(insertion, arc_radius, sweep, speed, phase):
-    stroke = Stroke(insertion, arc_radius, sweep, speed)
-    path = stroke.path()
-    found = Stroke.of(path)
-    assert (found.insertion, found.arc_radius, found.sweep) == (insertion, arc_radius, sweep)
-    assert found.speed == pytest.approx(speed, rel=1e-12)
-    # The same places, so many times as soon.
-    usual = Stroke(insertion, arc_radius, sweep).path()
-    moment = phase * (usual.insert_time + usual.lift_time)
-    times = np.array([usual.wait_time + moment, path.wait_time + moment / speed])
-    np.testing.assert_allclose(usual.at(times[:1]), path.at(times[1:]), atol=1e-9)
+def test_parameters_are_what_their_path_does(insertion, arc_radius, sweep, speed, phase):
+    path = ToolPath.of(insertion=insertion, arc_radius=arc_radius, sweep=sweep, speed=speed)
+    found = path.parameters()
+    assert found.pop("speed") == pytest.approx(speed, rel=1e-12)
+    assert found == {"insertion": insertion, "arc_radius": arc_radius, "sweep": sweep}
+    # The same places, sooner by the speed.
+    nominal = ToolPath.of(insertion=insertion, arc_radius=arc_radius, sweep=sweep)
+    moment = phase * (nominal.insert_time + nominal.lift_time)
+    times = np.array([nominal.wait_time + moment, path.wait_time + moment / speed])
+    np.testing.assert_allclose(nominal.at(times[:1]), path.at(times[1:]), atol=1e-9)
 
 
-def test_the_usual_path_has_the_usual_stroke():
-    assert Stroke.of(ToolPath()) == USUAL_STROKE == Stroke()
-    assert USUAL_STROKE.path() == ToolPath()
+def test_nominal_parameters_are_those_of_the_default_path():
+    assert LeverUp.nominal_parameters() == ToolPath().parameters()
+    assert ToolPath.of(**LeverUp.nominal_parameters()) == ToolPath()
+    assert LeverUp.at_edge(SQUARE, 0).path == ToolPath()
 
 
 @pytest.mark.parametrize(
-    ("stroke", "fault"),
+    ("parameters", "fault"),
     [
-        (Stroke(speed=0.0), "speed = 0.0 times the usual one: give a number above 0"),
-        (Stroke(speed=float("nan")), "speed = nan"),
-        (Stroke(speed=100.0), "insert_time = 0.006 is outside 0.05 to 60"),
-        (Stroke(insertion=0.2), "insertion = 0.2 is outside 0 to 0.1"),
+        ({"speed": 0.0}, "speed = 0.0 times the nominal one: give a number above 0"),
+        ({"speed": float("nan")}, "speed = nan"),
+        ({"speed": 100.0}, "insert_time = 0.006 is outside 0.05 to 60"),
+        ({"insertion": 0.2}, "insertion = 0.2 is outside 0 to 0.1"),
     ],
 )
-def test_paths_that_cannot_be_are_refused(stroke, fault):
+def test_paths_that_cannot_be_are_refused(parameters, fault):
     with pytest.raises(ActionError, match=fault):
-        stroke.path()
+        ToolPath.of(**parameters)

@@ -4,19 +4,22 @@ import mujoco
 import numpy as np
 import pytest
 
-from foretrace.actions import ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath, tool_transforms
 from foretrace.errors import ActionError
 from foretrace.geometry import pose_to_matrix
 from foretrace.interactions.record import Physics
+from foretrace.objects import Prism
 from foretrace.simulation import arm
-from foretrace.simulation.mujoco_engine import plan_control, tip_transforms
+from foretrace.simulation.lever_up import simulate
 from foretrace.simulation.scene import build_scene
-from foretrace.simulation.tool import Tool
+
+SQUARE = Prism([(0.0, 0.0), (0.2, 0.0), (0.2, 0.1), (0.0, 0.1)])
+ACTION = LeverUp.at_edge(SQUARE, 0)
 
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return build_scene(None, Physics(), Tool(), "arm", 0.002).compile()
+    return build_scene(None, Physics(), Screwdriver(), "arm", 0.002).compile()
 
 
 def flange_in_base(model: mujoco.MjModel, q: np.ndarray) -> np.ndarray:
@@ -37,7 +40,7 @@ def test_forward_kinematics_agree_with_ur_analytic_ik(model: mujoco.MjModel) -> 
 
 
 def test_inverse_kinematics_inverts_forward_kinematics(model: mujoco.MjModel) -> None:
-    T = tip_transforms(ToolPath(), np.array([1.0]))[0]
+    T = tool_transforms(ACTION.tool_motion(np.array([1.0])))[0]
     q = arm.solve_inverse_kinematics(model, T, np.array(arm.HOME))
     data = mujoco.MjData(model)
     data.qpos[:] = q
@@ -53,8 +56,9 @@ def test_unreachable_pose_is_refused(model: mujoco.MjModel) -> None:
 
 
 def test_too_fast_a_path_is_refused() -> None:
+    hasty = LeverUp.at_edge(SQUARE, 0, path=ToolPath(lift_time=0.06))
     with pytest.raises(ActionError, match="over its limit"):
-        plan_control(ToolPath(lift_time=0.06), Tool(), "arm", 0.002, 0.05)
+        simulate(SQUARE, hasty)
 
 
 def test_the_arm_keeps_clear_of_the_table(model: mujoco.MjModel) -> None:
@@ -63,7 +67,7 @@ def test_the_arm_keeps_clear_of_the_table(model: mujoco.MjModel) -> None:
     q = np.array(arm.HOME)
     table = model.geom("table").id
     moving = [g for g in range(model.ngeom) if model.geom_contype[g] == 4 and not model.geom(g).name]
-    for T in tip_transforms(ToolPath(), np.linspace(0, ToolPath().duration, 15)):
+    for T in tool_transforms(ACTION.tool_motion(np.linspace(0, ACTION.duration, 15))):
         q = arm.solve_inverse_kinematics(model, T, q)
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli import main
 from foretrace.errors import SimulationError
 from foretrace.interactions.dataset import Dataset
@@ -18,7 +18,6 @@ from foretrace.simulation.bullet_engine import BulletEngine
 from foretrace.simulation.bullet_world import COLLISION_MARGIN, World, connect
 from foretrace.simulation.free_motion import simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.tool import Tool
 
 pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
 
@@ -60,7 +59,7 @@ def test_collision_shapes_have_the_objects_size(obj: Prism) -> None:
 
 def test_the_blade_has_its_dimensions() -> None:
     """A blade of 1 mm in Bullet's usual margin of 1 mm would have round edges and no inside."""
-    world, tool = World(0.002, GRAVITY), Tool()
+    world, tool = World(0.002, GRAVITY), Screwdriver()
     blade = world.add_tool(tool, 0.3, not_against=())
     ball = world.bullet.createMultiBody(
         0.01, world.bullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.001)
@@ -92,9 +91,9 @@ def test_every_pair_has_its_own_friction(table: float, tool: float) -> None:
     assert 1.0 - motion.velocities[50, 0] == pytest.approx(table * 9.81 * 0.1, rel=0.03)
     world = World(0.002, GRAVITY)
     world.add_table(table)
-    blade = world.add_tool(Tool(), tool, not_against=(0,))
+    blade = world.add_tool(Screwdriver(), tool, not_against=(0,))
     body = world.add_object(Body.box((0.03, 0.002, 0.002), 0.01), np.eye(4))
-    start = [-0.02, 0.0, Tool().blade_thickness + 0.001 + COLLISION_MARGIN]
+    start = [-0.02, 0.0, Screwdriver().blade_thickness + 0.001 + COLLISION_MARGIN]
     world.bullet.resetBasePositionAndOrientation(body, start, [0, 0, 0, 1])
     # It lies on the blade, which is drawn away under it at 0.5 m/s: friction is at its limit.
     for _ in range(10):
@@ -133,7 +132,9 @@ def test_an_object_that_is_not_convex_is_levered_as_in_mujoco(capfd: pytest.Capt
 
 def test_a_sharp_rim_is_pushed_and_not_lifted() -> None:
     blunt = Prism(SQUARE.corners, bevel=NO_BEVEL)
-    motion = BulletEngine().play(blunt, LeverUp.at_edge(blunt, 0), ToolPath(pitch=0.0), Tool(), Physics())
+    action = LeverUp.at_edge(blunt, 0, path=ToolPath(pitch=0.0))
+    pose = action.T_action_object
+    motion = BulletEngine().play(blunt, pose, action.tool, action.tool_motion, action.duration, Physics())
     assert motion.object_pose[20, 0] - motion.object_pose[0, 0] > 0.01
 
 

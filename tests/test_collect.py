@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ import pytest
 from rich.console import Console
 
 import factories
+from foretrace.actions import ToolPath
 from foretrace.errors import DatasetError, SimulationError
+from foretrace.files import PARTIAL
 from foretrace.geometry import is_convex
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
@@ -218,28 +221,16 @@ def test_a_mixed_data_set_is_sound_reproducible_and_resumable(tmp_path, recipe):
     assert len(dataset.batch()) == len(dataset)
 
 
-def test_a_data_set_from_before_the_recipes_goes_on(tmp_path, reference):
-    folder = tmp_path / "old"
-    collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
-    manifest = storage.read_manifest(folder)
-    configuration = manifest["configuration"]
-    del configuration["recipe"], configuration["simulation"]["watch_time"]
-    for name in ("rolling_friction", "table_edge"):
-        del configuration["simulation"]["physics"][name]
-    table, _ = storage.read_shard(folder, storage.shard_name(0))
-    older = table.drop_columns(["fall_index", "rolling_friction", "table_edge"])
-    manifest["shards"][storage.shard_name(0)] = storage.write_shard(folder, storage.shard_name(0), older)
-    storage.write_manifest(folder, manifest)
-    assert len(Dataset.open(folder, failed=True)) == 208
-    (folder / storage.shard_name(1)).unlink()
-    collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
-    assert examine(folder).findings == ()
-    first = Dataset.open(folder)[0]
-    assert (first.effect.fall_index, first.physics.table_edge) == (None, None)
-    assert first.physics == Dataset.open(reference)[0].physics
+def test_other_settings_of_the_simulation_are_refused(tmp_path):
+    collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
     watched = replace(SMALL, simulation=SimulationConfig(watch_time=1.5))
     with pytest.raises(DatasetError, match=r"begun with simulation\.watch_time = 0\.0, asked for is"):
-        collect(watched, folder, workers=1, console=quiet(), simulate=fake_trial)
+        collect(watched, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
+    steeper = replace(SMALL, path=ToolPath(pitch=0.4))
+    with pytest.raises(
+        DatasetError, match=r"begun with path\.pitch = 0\.28, asked for is path\.pitch = 0\.4"
+    ):
+        collect(steeper, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
 
 
 def test_falls_and_edges_survive_storing(tmp_path):
@@ -351,7 +342,7 @@ def test_damage_is_made_good(reference, tmp_path):
     manifest = storage.read_manifest(tmp_path)
     del manifest["shards"][storage.shard_name(2)]  # killed between the shard and the manifest
     storage.write_manifest(tmp_path, manifest)
-    (tmp_path / storage.SHARD_FOLDER / "shard-00001.parquet.1.tmp").write_bytes(b"half")
+    (tmp_path / storage.SHARD_FOLDER / f".shard-00001.parquet.1{PARTIAL}").write_bytes(b"half")
     begun = time.time_ns()
     collect(SMALL, tmp_path, workers=1, console=quiet(), simulate=fake_trial)
     assert shards_of(tmp_path) == shards_of(reference)
@@ -377,7 +368,7 @@ def test_kill_9_loses_only_the_shards_in_work(reference, tmp_path):
             time.sleep(0.01)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-        done = {name: sha for name, sha in shards_of(folder).items() if not name.endswith(".tmp")}
+        done = {name: sha for name, sha in shards_of(folder).items() if not name.endswith(PARTIAL)}
         assert 1 <= len(done) < 3
         collect(SMALL, folder, workers=1, console=quiet(), simulate=fake_trial)
     finally:
@@ -408,7 +399,7 @@ def test_workers_never_hear_ctrl_c_and_the_parent_does(tmp_path):
 
 
 def test_progress_is_reported_in_plain_lines_without_a_terminal(tmp_path, monkeypatch):
-    monkeypatch.setattr(collecting, "PLAIN_REPORT_PERIOD", 0.0)
+    monkeypatch.setattr(collecting, "ProgressReport", partial(collecting.ProgressReport, period=1e-9))
     console = Console(file=(tmp_path / "log").open("w+"), force_terminal=False, width=40)
     collect(CollectConfig(objects=8), tmp_path / "data", workers=1, console=console, simulate=fake_trial)
     console.file.seek(0)

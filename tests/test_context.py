@@ -43,7 +43,7 @@ def batch() -> InteractionBatch:
     friction, density = rng.uniform(0.4, 1.2, 40), rng.uniform(300, 1200, 40)
     rest = made.com[:, :1]
     com = rest + (made.com - rest) * (1.3 - friction)[:, None, None]
-    return replace(made, friction=friction, density=density, com=com)
+    return replace(made, com=com, parameters=made.parameters | {"friction": friction, "density": density})
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,9 @@ def test_the_context_is_standardised_by_the_training_part(run, batch):
 
 
 def test_constants_that_never_vary_are_only_shifted(batch):
-    same = replace(batch, friction=np.full(40, 0.8), density=np.full(40, 600.0))
+    same = replace(
+        batch, parameters=batch.parameters | {"friction": np.full(40, 0.8), "density": np.full(40, 600.0)}
+    )
     predictor, _ = fit_predictor(same, CONDITIONED, split_by_seed(40, 0, None), TRAINING)
     assert predictor.known_scale.tolist() == [1.0, 1.0]
     assert np.isfinite(predictor.imagine_batch(same).com).all()
@@ -110,7 +112,7 @@ def test_an_interrupted_training_goes_on_and_another_one_is_refused(tmp_path, ru
     with pytest.raises(TrainingError, match=r"config\.context = \['friction', 'density'\], not \[\]"):
         train_predictor(batch, CONFIG, folder, TRAINING, progress=False)
     assert fingerprint(batch, NAMES) != fingerprint(batch)
-    heavier = replace(batch, density=2 * batch.density)
+    heavier = replace(batch, parameters=batch.parameters | {"density": 2 * batch.parameters["density"]})
     assert fingerprint(heavier) == fingerprint(batch)
     with pytest.raises(TrainingError, match=r"training\.data"):
         train_predictor(heavier, CONDITIONED, folder, TRAINING, progress=False)
@@ -148,7 +150,7 @@ def test_missing_unknown_or_infinite_context_is_refused(run, batch, context, mes
     predictor = load_predictor(run)
     with pytest.raises(PredictionError, match=message):
         predictor.imagine(view_of(batch, 0), context=context)
-    with pytest.raises(PredictionError, match=f"candidate 0: .*{message}"):
+    with pytest.raises(PredictionError, match=message):
         predictor.imagine_candidates(view_of(batch, 0), [LeverUp((0, 0), (1, 0))], context=context)
 
 
@@ -158,7 +160,8 @@ def test_context_for_a_predictor_without_any_is_refused(batch):
 
 
 def test_interactions_without_a_record_are_named(run, batch):
-    unknown = replace(batch, density=np.where(batch.ids == 11, np.nan, batch.density))
+    density = np.where(batch.ids == 11, np.nan, batch.parameters["density"])
+    unknown = replace(batch, parameters=batch.parameters | {"density": density})
     message = (
         "interaction 11 has density = nan: record its density, leave it out, or use a predictor that is not"
     )
@@ -211,7 +214,8 @@ def test_the_actions_parameters_are_context_as_constants_are(batch):
     rng = np.random.default_rng(3)
     sweep = rng.uniform(0.4, 1.0, 40)
     rest = batch.com[:, :1]
-    farther = replace(batch, sweep=sweep, com=rest + (batch.com - rest) * sweep[:, None, None])
+    moved = rest + (batch.com - rest) * sweep[:, None, None]
+    farther = replace(batch, com=moved, parameters=batch.parameters | {"sweep": sweep})
     config = replace(CONFIG, context=("sweep", "speed"), hidden=32)
     split = split_by_seed(40, 0, None)
     predictor, _ = fit_predictor(farther, config, split, LONGER)
@@ -232,8 +236,9 @@ def test_the_actions_parameters_are_context_as_constants_are(batch):
 
 def test_predict_is_conditioned_on_the_action_and_compares_with_it(tmp_path, batch, capsys):
     sweep = np.random.default_rng(3).uniform(0.4, 1.0, 40)
+    swept = replace(batch, parameters=batch.parameters | {"sweep": sweep})
     config = replace(CONFIG, context=("sweep",))
-    run = train_predictor(replace(batch, sweep=sweep), config, tmp_path / "run", TRAINING, progress=False)
+    run = train_predictor(swept, config, tmp_path / "run", TRAINING, progress=False)
     polygon = tmp_path / "polygon.txt"
     polygon.write_text("0.1 0\n0.02 0.09\n-0.08 0.05\n-0.07 -0.06\n0.04 -0.09\n")
     command = ["predict", str(run), "--polygon", str(polygon), "--edge", "1", "--compare", "--no-animation"]

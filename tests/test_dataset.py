@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import factories
 from foretrace.errors import DatasetError
+from foretrace.files import PARTIAL, sole_writer
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.doctor import examine
@@ -118,6 +119,8 @@ def test_dataset_slices_and_filters(folder):
     assert len(dataset.where(outcome="missed").batch()) == 0
     with pytest.raises(DatasetError, match=r"no column 'corner'.* num_corners"):
         dataset.where(corner=3)
+    with pytest.raises(DatasetError, match=r"no outcome 'sliped': choose from levered, slipped, .*failed"):
+        dataset.where(outcome=("levered", "sliped"))
     with pytest.raises(DatasetError, match="no interaction 13"):
         dataset.with_id(13)
     with pytest.raises(IndexError):
@@ -140,7 +143,7 @@ def test_batch_equals_the_interactions_one_by_one(folder):
         np.testing.assert_array_equal(batch.height[k], interaction.view.height)
         np.testing.assert_array_equal(batch.support_points[k], effect.support_points)
         assert batch.outcome[k] == effect.outcome
-        assert batch.tool_friction[k] == interaction.physics.tool_friction
+        assert batch.parameters["tool_friction"][k] == interaction.physics.tool_friction
         corners = batch.corners[k, : batch.num_corners[k]]
         assert np.isnan(batch.corners[k, batch.num_corners[k] :]).all()
         pose = effect.pose_trajectory[0]  # the object still lies flat: a turn about z and a shift
@@ -201,13 +204,19 @@ def test_opening_another_version_or_a_damaged_manifest(folder):
     path = folder / storage.MANIFEST
     manifest = json.loads(path.read_text())
     path.write_text(json.dumps({**manifest, "format_version": 99}))
-    with pytest.raises(DatasetError, match="format version 99, this foretrace reads version 1"):
+    with pytest.raises(DatasetError, match="format version 99, this foretrace reads version 2"):
         Dataset.open(folder)
     path.write_text(json.dumps({**manifest, "format": "other"}))
-    with pytest.raises(DatasetError, match="not a manifest"):
+    with pytest.raises(DatasetError, match="does not describe a foretrace-interactions"):
+        Dataset.open(folder)
+    path.write_text(json.dumps({**manifest, "shards": []}))
+    with pytest.raises(DatasetError, match=r"is damaged \(its shards is \[\]\)"):
+        Dataset.open(folder)
+    path.write_text(json.dumps({**manifest, "format_version": 1}))
+    with pytest.raises(DatasetError, match=r"upgrade it in place with `foretrace data .* --upgrade`"):
         Dataset.open(folder)
     path.write_text(path.read_text()[:50])
-    with pytest.raises(DatasetError, match="is damaged"):
+    with pytest.raises(DatasetError, match="cannot be read as JSON"):
         Dataset.open(folder)
 
 
@@ -220,8 +229,8 @@ def flip_a_bit(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (Path.unlink, r"shard .*shard-00001\.parquet cannot be read.*foretrace doctor"),
-        (flip_a_bit, r"shard .*shard-00001\.parquet is corrupt.*foretrace doctor"),
+        (Path.unlink, r"shard .*shard-00001\.parquet cannot be read.*foretrace data"),
+        (flip_a_bit, r"shard .*shard-00001\.parquet is corrupt.*foretrace data"),
         (lambda path: os.truncate(path, 100), r"shard .*shard-00001\.parquet is corrupt"),
     ],
 )
@@ -271,7 +280,7 @@ def test_doctor_finds_nothing_in_a_sound_data_set(folder):
 
 def test_doctor_repairs_what_can_be_repaired(folder):
     flip_a_bit(folder / storage.shard_name(1))
-    (folder / storage.SHARD_FOLDER / "shard-00002.parquet.123.tmp").write_bytes(b"half")
+    (folder / storage.SHARD_FOLDER / f".shard-00002.parquet.123{PARTIAL}").write_bytes(b"half")
     manifest = storage.read_manifest(folder)
     checksum = manifest["shards"].pop(storage.shard_name(0))
     storage.write_manifest(folder, manifest)
@@ -281,7 +290,7 @@ def test_doctor_repairs_what_can_be_repaired(folder):
     assert storage.read_manifest(folder) == manifest, "without --repair nothing changes"
 
     repaired = examine(folder, repair=True)
-    assert {f.file.split(".")[0] for f in repaired.findings if f.repaired} == {
+    assert {f.file.replace("/.", "/").split(".")[0] for f in repaired.findings if f.repaired} == {
         "shards/shard-00000",
         "shards/shard-00001",
         "shards/shard-00002",
@@ -289,7 +298,7 @@ def test_doctor_repairs_what_can_be_repaired(folder):
     left = [f for f in repaired.findings if not f.repaired]
     assert [f.file for f in left] == [storage.shard_name(1)]
     assert "simulate" in left[0].problem
-    assert not list(folder.rglob("*.tmp"))
+    assert not list(folder.rglob(f"*{PARTIAL}"))
     assert storage.read_manifest(folder)["shards"][storage.shard_name(0)] == checksum
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -338,7 +347,7 @@ def test_doctor_finds_unsound_rows(folder, column, change, problem):
 
 
 def test_only_one_process_writes(folder):
-    with storage.sole_writer(folder), pytest.raises(DatasetError, match="another foretrace writes to"):
+    with sole_writer(folder, DatasetError), pytest.raises(DatasetError, match="another foretrace writes to"):
         examine(folder, repair=True)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from foretrace.actions import LeverUp, sample_reachable_contacts
+from foretrace.actions import LeverUp, Screwdriver, sample_reachable_contacts
 from foretrace.geometry import is_convex, quaternion_to_matrix, tilt
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.topdown import TopDownView
@@ -21,7 +21,6 @@ from foretrace.objects import (
 )
 from foretrace.objects.flat import HALF_LENGTHS, HEIGHTS
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.tool import Tool
 
 FAMILIES = (sample_oval, sample_rounded, sample_organic, sample_dented)
 WATCHED = SimulationConfig(embodiment="tool", watch_time=1.5)
@@ -60,7 +59,7 @@ def test_ovals_and_rounded_ones_are_convex_dented_ones_are_not():
 
 
 def test_contacts_spread_over_the_outline_where_a_blade_gets():
-    half = Tool().blade_width / 2
+    half = Screwdriver().blade_width / 2
     for obj in draw(sample_dented, 8):
         actions = sample_reachable_contacts(obj, np.random.default_rng(1), 40)
         outline = shapely.Polygon(obj.corners)
@@ -97,7 +96,7 @@ def test_a_disc_levered_at_its_rim_is_lifted_and_does_not_roll(height: float, sh
     angles = 2 * np.pi * np.arange(64) / 64
     disc = Prism(0.09 * np.column_stack([np.cos(angles), np.sin(angles)]), height)
     effect = simulate_lever_up(disc, LeverUp.at_edge(disc, 10, share), WATCHED).effect
-    assert effect.outcome is Outcome.LEVERED
+    assert effect.outcome == Outcome.LEVERED
     tilts = np.rad2deg(tilt(quaternion_to_matrix(effect.pose_trajectory[:, 3:])))
     assert 20 < tilts.max() < 60
     # It turns about the far rim: nothing moves it sideways.

@@ -136,7 +136,7 @@ def test_the_lowest_point() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"engine": "ode"}, "engine 'ode' is unknown: choose one of mujoco, bullet"),
+        ({"engine": "ode"}, "unknown engine 'ode'; available: mujoco, bullet"),
         ({"start": [0, 0, 0, 2, 0, 0, 0]}, "has not the length 1"),
         ({"start": [0, 0, np.nan, 1, 0, 0, 0]}, "seven finite numbers"),
         ({"timestep": 0.0}, r"timestep = 0\.0 s"),

@@ -11,7 +11,7 @@ from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Outcome, Physics
 from foretrace.objects import Prism, paper_objects
 from foretrace.simulation.engine import Motion
-from foretrace.simulation.lever_up import SimulationConfig, judge, simulate_lever_up
+from foretrace.simulation.lever_up import SimulationConfig, effect_of, simulate_lever_up
 
 TOOL = SimulationConfig(embodiment="tool")
 
@@ -34,9 +34,9 @@ def some_trials() -> list[tuple[Prism, LeverUp]]:
 
 def test_an_object_out_of_reach_stays_where_it_is() -> None:
     obj = regular_prism()
-    before_the_rim = SimulationConfig(embodiment="tool", path=ToolPath(insertion=0.0, sweep=0.0))
-    effect = simulate_lever_up(obj, LeverUp.at_edge(obj, 2), before_the_rim).effect
-    assert effect.outcome is Outcome.MISSED
+    before_the_rim = LeverUp.at_edge(obj, 2, path=ToolPath(insertion=0.0, sweep=0.0))
+    effect = simulate_lever_up(obj, before_the_rim, TOOL).effect
+    assert effect.outcome == Outcome.MISSED
     np.testing.assert_allclose(effect.com_trajectory, effect.com_trajectory[:1].repeat(60, 0), atol=1e-4)
 
 
@@ -45,7 +45,7 @@ def test_a_hexagon_is_levered_about_its_far_edge(embodiment: str) -> None:
     obj = regular_prism()
     action = LeverUp.at_edge(obj, edge=2)
     effect = simulate_lever_up(obj, action, SimulationConfig(embodiment=embodiment)).effect
-    assert effect.outcome is Outcome.LEVERED
+    assert effect.outcome == Outcome.LEVERED
     assert effect.slip_index is None
     assert effect.support_corners == (0, 5)
     assert len(effect.times) == 60
@@ -103,7 +103,7 @@ def test_the_mirrored_object_gives_the_mirrored_effect() -> None:
         first = simulate_lever_up(obj, action, TOOL).effect
         second = simulate_lever_up(flipped, mirrored, TOOL).effect
         assert first.outcome == second.outcome
-        if first.outcome is Outcome.LEVERED:
+        if first.outcome == Outcome.LEVERED:
             differences.append(path_difference(first.com_trajectory, second.com_trajectory * mirror))
     assert len(differences) >= 6
     assert np.median(differences) < 0.3
@@ -114,7 +114,7 @@ def test_arm_and_tool_alone_have_the_same_effect() -> None:
     for obj, action in some_trials():
         arm, tool = simulate_lever_up(obj, action).effect, simulate_lever_up(obj, action, TOOL).effect
         assert arm.path_error < 1e-3
-        if arm.outcome is tool.outcome is Outcome.LEVERED:
+        if arm.outcome == tool.outcome == Outcome.LEVERED:
             compared += 1
             assert path_difference(arm.com_trajectory, tool.com_trajectory) < 2.0
     assert compared >= 6
@@ -125,7 +125,7 @@ def test_half_the_time_step_agrees() -> None:
     differences = []
     for obj, action in some_trials():
         full, fine = simulate_lever_up(obj, action, TOOL).effect, simulate_lever_up(obj, action, half).effect
-        if full.outcome is fine.outcome is Outcome.LEVERED:
+        if full.outcome == fine.outcome == Outcome.LEVERED:
             differences.append(path_difference(full.com_trajectory, fine.com_trajectory))
     assert len(differences) >= 6
     assert np.median(differences) < 0.1
@@ -134,7 +134,7 @@ def test_half_the_time_step_agrees() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"engine": "ode"}, "engine 'ode' is unknown: choose one of mujoco"),
+        ({"engine": "ode"}, "unknown engine 'ode'; available: mujoco"),
         ({"embodiment": "hand"}, "embodiment 'hand' is unknown: choose one of arm, tool"),
         ({"camera": "fisheye"}, "camera 'fisheye' is unknown: choose one of exact, rgbd"),
         ({"timestep": 0.003}, r"timestep = 0\.003 s does not divide"),
@@ -154,10 +154,8 @@ def test_a_thrown_object_counts_as_failed() -> None:
     """A blade at 60 m/s throws the object: the record says failed and holds no data."""
     obj = regular_prism()
     path = ToolPath(lift_time=0.05, arc_radius=1.0, sweep=1.5)
-    effect = simulate_lever_up(
-        obj, LeverUp.at_edge(obj, 2), SimulationConfig(embodiment="tool", path=path)
-    ).effect
-    assert effect.outcome is Outcome.FAILED
+    effect = simulate_lever_up(obj, LeverUp.at_edge(obj, 2, path=path), TOOL).effect
+    assert effect.outcome == Outcome.FAILED
     assert len(effect.times) == len(effect.pose_trajectory) == len(effect.com_trajectory) == 0
 
 
@@ -194,6 +192,6 @@ def test_outcomes(angles: list[int], touches: str, outcome: Outcome, slip: int |
     on_blade = np.array([t == "1" for t in touches])
     rise = 0.03 * np.arange(6.0)
     motion = synthetic_motion(np.array(angles), on_blade, None if outcome is Outcome.MISSED else rise)
-    effect = judge(motion, obj, LeverUp.at_edge(obj, 2), Physics())
-    assert effect.outcome is outcome
+    effect = effect_of(motion, obj, LeverUp.at_edge(obj, 2), Physics())
+    assert effect.outcome == outcome
     assert effect.slip_index == slip

@@ -332,10 +332,12 @@ def test_outcomes_that_are_not_learned_are_refused(batch):
 
 
 def test_the_context_changes_what_is_predicted(batch):
-    varied = replace(batch, friction=np.linspace(0.3, 0.9, len(batch)))
+    varied = replace(batch, parameters=batch.parameters | {"friction": np.linspace(0.3, 0.9, len(batch))})
     config = replace(CONFIG, context=("friction",))
     predictor, _ = fit_predictor(varied, config, everything(varied), replace(QUICK, epochs=20))
-    other = predictor.imagine_batch(replace(varied, friction=varied.friction[::-1]))
+    other = predictor.imagine_batch(
+        replace(varied, parameters=varied.parameters | {"friction": varied.parameters["friction"][::-1]})
+    )
     assert not np.allclose(other.com, predictor.imagine_batch(varied).com, atol=1e-7)
 
 

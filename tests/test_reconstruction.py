@@ -13,7 +13,9 @@ def batch():
 
 
 def test_masks_come_back_in_their_shape(batch):
-    predictor = LstmConfig(features="ae-256", feature_options=dict(QUICK_OPTIONS["ae-256"]), hidden=8).make(12)
+    predictor = LstmConfig(features="ae-256", feature_options=dict(QUICK_OPTIONS["ae-256"]), hidden=8).make(
+        12
+    )
     restored = reconstruct_masks(predictor, batch)
     assert restored.shape == batch.mask.shape
     assert restored.dtype == bool

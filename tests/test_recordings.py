@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import factories
+from foretrace.actions import Motion
 from foretrace.cli import main
 from foretrace.errors import DatasetError, PerceptionError
 from foretrace.geometry import rotation_angle
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
-from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.recorded import add_recorded
@@ -243,14 +243,20 @@ def test_outcomes_from_motion_alone_agree_with_those_that_saw_the_blade(
     recorded: tuple[Path, RecordingTruth],
 ) -> None:
     effect = recorded[1].interaction.effect
-    assert judge_motion(PRISM, effect.pose_trajectory, effect.com_trajectory) == (Outcome.LEVERED, None)
+
+    def judged(poses: np.ndarray, com: np.ndarray) -> tuple[str, int | None]:
+        unseen = np.empty((len(poses), 0))
+        judgement = ACTION.judge(Motion(effect.times[: len(poses)], poses, poses, unseen), PRISM, com)
+        return judgement.outcome, judgement.slip_index
+
+    assert judged(effect.pose_trajectory, effect.com_trajectory) == (Outcome.LEVERED, None)
     dropped = effect.pose_trajectory.copy()
     dropped[40:] = dropped[0]
     com = effect.com_trajectory.copy()
     com[40:] = com[0]
-    assert judge_motion(PRISM, dropped, com) == (Outcome.SLIPPED, 40)
+    assert judged(dropped, com) == (Outcome.SLIPPED, 40)
     still = np.repeat(dropped[:1], 60, axis=0)
-    assert judge_motion(PRISM, still, np.repeat(com[:1], 60, axis=0)) == (Outcome.MISSED, None)
+    assert judged(still, np.repeat(com[:1], 60, axis=0)) == (Outcome.MISSED, None)
 
 
 def test_only_mujoco_films() -> None:

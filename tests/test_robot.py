@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foretrace import cli
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.errors import RobotError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.record import Physics
@@ -22,7 +22,6 @@ from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, plan_ret
 from foretrace.simulation import arm
 from foretrace.simulation.engine import tip_transforms
 from foretrace.simulation.scene import build_scene
-from foretrace.simulation.tool import Tool
 from ur_controller import RunningController
 
 ACTION = LeverUp((0.1, 0.2), (0.6, 0.8))
@@ -32,7 +31,7 @@ GOOD = np.array([2.9, -1.2, 2.3, -3.0, -1.5, 1.3])
 
 @pytest.fixture(scope="module")
 def kinematics() -> ArmKinematics:
-    return ArmKinematics(Tool())
+    return ArmKinematics(Screwdriver())
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_the_blade_follows_the_tool_path_on_the_table(legs):
     times = np.minimum(0.5 * legs[1].times, ToolPath().duration)
     wanted = np.linalg.inv(ACTION.T_action_object) @ tip_transforms(ToolPath(), times)
     flanges = np.array([ur.ur10.forward_kinematics(*q) for q in legs[1].joints])
-    tips = T_TABLE_BASE @ flanges @ arm.T_flange_tip(Tool())
+    tips = T_TABLE_BASE @ flanges @ arm.T_flange_tip(Screwdriver())
     np.testing.assert_allclose(tips, wanted, atol=2e-5)
 
 
@@ -158,7 +157,7 @@ def test_a_base_that_is_lower_than_calibrated_puts_the_blade_into_the_table(kine
 
 
 def test_clearance_agrees_with_the_collision_checker(kinematics):
-    model = build_scene(None, Physics(), Tool(), "arm", 0.002).compile()
+    model = build_scene(None, Physics(), Screwdriver(), "arm", 0.002).compile()
     data = mujoco.MjData(model)
     data.qpos[:] = GOOD
     mujoco.mj_kinematics(model, data)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from foretrace.actions import Screwdriver
 from foretrace.errors import RobotError
 from foretrace.interactions.recording_folder import RecordingNotes
 from foretrace.robot.checks import ArmLimits
@@ -18,7 +19,6 @@ from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath
 from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD
-from foretrace.simulation.tool import Tool
 from ur_controller import RunningController
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde: pip install 'foretrace[ur]'")
@@ -40,7 +40,7 @@ HALF = 30
 
 @pytest.fixture(scope="module")
 def kinematics() -> ArmKinematics:
-    return ArmKinematics(Tool())
+    return ArmKinematics(Screwdriver())
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ from foretrace.objects import (
 from foretrace.objects.model import convex_mass_properties
 from foretrace.simulation.camera import RgbdConfig, take_rgbd
 from foretrace.simulation.engine import Motion
-from foretrace.simulation.lever_up import SimulationConfig, judge, simulate_lever_up
+from foretrace.simulation.lever_up import SimulationConfig, effect_of, simulate_lever_up
 
 WATCHED = SimulationConfig(embodiment="tool", watch_time=1.5)
 RADIUS, LENGTH = 0.025, 0.12
@@ -168,7 +168,7 @@ def test_bad_solids_are_refused(make: Callable, fault: str):
 
 def test_a_cylinder_levered_at_its_side_rolls_away_without_slipping():
     effect = play(CYLINDER, SIDE)
-    assert effect.outcome is Outcome.ROLLED
+    assert effect.outcome == Outcome.ROLLED
     assert effect.slip_index is effect.fall_index is None
     assert effect.support_corners == ()
     assert np.isnan(effect.support_points).all()
@@ -196,7 +196,7 @@ def test_rolling_friction_stops_it_sooner():
 
 def test_a_box_levered_at_its_side_tumbles_over_its_far_edge():
     effect = play(BOX, SIDE)
-    assert effect.outcome is Outcome.TUMBLED
+    assert effect.outcome == Outcome.TUMBLED
     assert effect.slip_index is None
     assert effect.support_corners == (2, 3)
     np.testing.assert_allclose(effect.support_points[:, 0], 2 * RADIUS - BOX.bevel.width, atol=1e-3)
@@ -209,7 +209,7 @@ def test_a_box_levered_at_its_side_tumbles_over_its_far_edge():
 
 def test_a_box_levered_at_its_end_is_lifted_about_the_other_end():
     effect = play(BOX, END)
-    assert effect.outcome is Outcome.LEVERED
+    assert effect.outcome == Outcome.LEVERED
     assert effect.support_corners == (0, 3)
     assert 20 < tilt_of(effect)[-1] < 80
     assert effect.com_trajectory[-1, 2] > 1.5 * RADIUS
@@ -224,9 +224,9 @@ def test_same_picture_three_fates():
 @pytest.mark.parametrize("obj", [CYLINDER, BOX], ids=["cylinder", "box"])
 def test_left_alone_they_rest(obj: ObjectModel, table_edge: float | None):
     still = ToolPath(insertion=0.0, sweep=0.0)
-    config = replace(WATCHED, path=still, physics=Physics(table_edge=table_edge))
-    effect = play(obj, SIDE, config=config)
-    assert effect.outcome is Outcome.MISSED
+    config = replace(WATCHED, physics=Physics(table_edge=table_edge))
+    effect = simulate_lever_up(obj, LeverUp.at_edge(obj, SIDE, path=still), config).effect
+    assert effect.outcome == Outcome.MISSED
     assert len(effect.times) == 90
     assert np.abs(effect.com_trajectory - effect.com_trajectory[0]).max() < 3e-4
     assert np.abs(np.diff(effect.com_trajectory[20:], axis=0)).max() < 5e-6
@@ -246,7 +246,7 @@ def test_a_cylinder_rolls_off_a_short_table_and_the_record_ends_above_the_floor(
     edge = 0.12
     effect = play(CYLINDER, SIDE, config=replace(WATCHED, physics=Physics(table_edge=edge)))
     whole = play(CYLINDER, SIDE)
-    assert effect.outcome is Outcome.ROLLED
+    assert effect.outcome == Outcome.ROLLED
     k = effect.fall_index
     assert k is not None
     com = effect.com_trajectory
@@ -303,8 +303,8 @@ def motion_of(turns_deg: list[float], com: np.ndarray, on_blade: str, height: fl
 )
 def test_outcomes_of_a_cylinder(turns, rises, touches, outcome, slip):
     com = np.column_stack([np.linspace(0, 0.05, 6), np.zeros(6), RADIUS * (1 + np.array(rises))])
-    effect = judge(motion_of(turns, com, touches), CYLINDER, LeverUp.at_edge(CYLINDER, SIDE), Physics())
-    assert effect.outcome is outcome
+    effect = effect_of(motion_of(turns, com, touches), CYLINDER, LeverUp.at_edge(CYLINDER, SIDE), Physics())
+    assert effect.outcome == outcome
     assert effect.slip_index == slip
 
 
@@ -313,7 +313,7 @@ def test_spinning_flat_on_the_table_is_no_rolling():
     pose = np.zeros((6, 7))
     pose[:, 3], pose[:, 6] = np.cos(angle), np.sin(angle)
     motion = replace(motion_of([0] * 6, np.tile([0, 0, RADIUS], (6, 1)), "111111"), object_pose=pose)
-    assert judge(motion, CYLINDER, LeverUp.at_edge(CYLINDER, SIDE), Physics()).outcome is Outcome.MISSED
+    assert effect_of(motion, CYLINDER, LeverUp.at_edge(CYLINDER, SIDE), Physics()).outcome == Outcome.MISSED
 
 
 @pytest.mark.parametrize(
@@ -323,10 +323,10 @@ def test_a_fall_is_noticed_and_the_record_cut(depths, kept):
     com = np.column_stack([np.arange(5) * 0.1, np.zeros(5), RADIUS + np.array(depths)])
     motion = motion_of([0, 60, 120, 180, 240], com, "00000")
     action = LeverUp.at_edge(CYLINDER, SIDE)
-    effect = judge(motion, CYLINDER, action, Physics(table_edge=0.1))
+    effect = effect_of(motion, CYLINDER, action, Physics(table_edge=0.1))
     assert effect.fall_index == next(k for k, depth in enumerate(depths) if depth < -RADIUS)
     assert len(effect.times) == len(effect.com_trajectory) == len(effect.joint_trajectory) == kept
-    assert judge(motion, CYLINDER, action, Physics()).fall_index is None  # nowhere to fall from
+    assert effect_of(motion, CYLINDER, action, Physics()).fall_index is None  # nowhere to fall from
 
 
 @pytest.mark.parametrize(

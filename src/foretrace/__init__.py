@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from foretrace.actions import LeverUp, ToolPath
+    from foretrace.actions import Action, LeverUp, ToolPath
     from foretrace.errors import ForetraceError
     from foretrace.features import FeatureExtractor
     from foretrace.interactions.dataset import Dataset, InteractionBatch
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
         train_predictor,
     )
     from foretrace.simulation.collect import CollectConfig, collect
-    from foretrace.simulation.lever_up import SimulationConfig, simulate, simulate_lever_up
+    from foretrace.simulation.lever_up import SimulationConfig, replay, simulate, simulate_lever_up
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "foretrace.actions": ("LeverUp", "ToolPath"),
+    "foretrace.actions": ("Action", "LeverUp", "ToolPath"),
     "foretrace.errors": ("ForetraceError",),
     "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
@@ -50,11 +50,12 @@ _HOMES = {
         *("load_predictor", "train_predictor"),
     ),
     "foretrace.simulation.collect": ("CollectConfig", "collect"),
-    "foretrace.simulation.lever_up": ("SimulationConfig", "simulate", "simulate_lever_up"),
+    "foretrace.simulation.lever_up": ("SimulationConfig", "replay", "simulate", "simulate_lever_up"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Action",
     "Bevel",
     "Box",
     "CollectConfig",
@@ -82,6 +83,7 @@ __all__ = [
     "collect",
     "load_predictor",
     "paper_objects",
+    "replay",
     "sample_prism",
     "simulate",
     "simulate_lever_up",

@@ -1,165 +1,24 @@
-"""The lever-up action: where the blade goes under the object, and which way it pushes."""
+"""The lever-up action: a blade is pushed under the object and lifts it (paper, section 4)."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
+from foretrace.actions.base import Action, minimum_jerk
+from foretrace.actions.lever_up_judge import Outcome, judge_lever_up
+from foretrace.actions.motion import FAILED, Judgement, Motion
+from foretrace.actions.tool import Screwdriver, check_ranges
 from foretrace.errors import ActionError
-from foretrace.geometry import Numbers, inward_normals
 from foretrace.objects import ObjectModel
 
-CORNER_MARGIN = 0.001
-"""A contact point snapped to the outline keeps this distance from the corners [m]."""
-CONTACT_TOLERANCE = 0.005
-"""A contact may lie this far from the outline, as when it was measured with an error [m]."""
 APPROACH = (0.0035, 0.002, 0.3)
-"""What must be free before a sampled contact: this far to either side, from so near to so far away [m]."""
+"""Free space before a sampled contact: half its width, its nearest and its farthest end [m]."""
+SCREWDRIVER = Screwdriver()
 BEHIND = 0.085
 """The view from above ends a little farther behind the contact than this [m]."""
-
-
-@dataclass(frozen=True, eq=False, init=False)
-class LeverUp:
-    """A lever-up, placed on its object (paper, section 4).
-
-    Raises:
-        ActionError: if a value is not finite or the direction has no length.
-    """
-
-    contact: Float[np.ndarray, "2"]
-    """Where the blade meets the outline, in the object frame [m]."""
-    direction: Float[np.ndarray, "2"]
-    """Unit vector along which the blade is pushed, in the object frame; usually the inward edge normal."""
-
-    def __init__(self, contact: Numbers, direction: Numbers) -> None:
-        contact = plane_vector("contact", contact)
-        direction = plane_vector("direction", direction)
-        length = np.linalg.norm(direction)
-        if length < 1e-9:
-            raise ActionError(f"direction {direction.tolist()} has no length: give a vector into the object")
-        object.__setattr__(self, "contact", contact)
-        object.__setattr__(self, "direction", direction / length)
-        self.contact.setflags(write=False)
-        self.direction.setflags(write=False)
-
-    @classmethod
-    def at_edge(cls, obj: ObjectModel, edge: int, fraction: float = 0.5) -> "LeverUp":
-        """The lever-up at a fraction of an edge, pushing along its inward normal.
-
-        Args:
-            obj: the object.
-            edge: number of the edge; edge k runs from corner k to corner k + 1.
-            fraction: how far along the edge, strictly between 0 and 1.
-
-        Raises:
-            ActionError: if there is no such edge or the fraction leaves it.
-        """
-        num_edges = len(obj.corners)
-        if not 0 <= edge < num_edges:
-            raise ActionError(f"edge {edge} of an object with {num_edges} edges: choose 0 to {num_edges - 1}")
-        if not 0 < fraction < 1:
-            raise ActionError(f"fraction {fraction} of an edge: choose one between 0 and 1, both excluded")
-        start, stop = obj.corners[edge], obj.corners[(edge + 1) % num_edges]
-        return cls(start + fraction * (stop - start), inward_normals(obj.corners)[edge])
-
-    @classmethod
-    def nearest(cls, obj: ObjectModel, point: Numbers) -> "LeverUp":
-        """The lever-up at the point of the outline nearest to a given one, pushing along that edge's normal.
-
-        Near a corner the contact keeps a millimetre from it (or half of a shorter edge), on the edge that
-        faces the point more directly.
-
-        Raises:
-            ActionError: if the point is not finite.
-        """
-        point = plane_vector("contact point", point)
-        starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
-        lengths = np.linalg.norm(stops - starts, axis=1)
-        along = ((point - starts) * (stops - starts)).sum(axis=1) / lengths**2
-        margin = np.minimum(CORNER_MARGIN / lengths, 0.5)
-        fractions = np.clip(along, margin, 1 - margin)
-        contacts = starts + fractions[:, None] * (stops - starts)
-        edge = int(np.argmin(np.linalg.norm(contacts - point, axis=1)))
-        return cls(contacts[edge], inward_normals(obj.corners)[edge])
-
-    def check_contact(self, obj: ObjectModel) -> None:
-        """Refuse an action that does not start on an object's outline.
-
-        Raises:
-            ActionError: if the contact lies more than ``CONTACT_TOLERANCE`` from it.
-        """
-        distance = shapely.distance(shapely.LinearRing(obj.corners), shapely.Point(self.contact))
-        if distance > CONTACT_TOLERANCE:
-            x, y = self.contact
-            raise ActionError(
-                f"contact ({x:.4f}, {y:.4f}) m lies {1e3 * distance:.1f} mm from the object's outline: "
-                "take LeverUp.nearest or LeverUp.at_edge"
-            )
-
-    def moved(self, ahead: float, left: float, turn: float) -> "LeverUp":
-        """The action shifted along its direction and to its left [m], then turned to the left [rad]."""
-        x, y = self.direction
-        contact = self.contact + ahead * np.array([x, y]) + left * np.array([-y, x])
-        c, s = np.cos(turn), np.sin(turn)
-        return LeverUp(contact, np.array([c * x - s * y, s * x + c * y]))
-
-    @property
-    def T_action_object(self) -> Float[np.ndarray, "4 4"]:
-        """Transform from the object frame at rest to the action frame.
-
-        The contact point becomes the origin, the direction the x axis; z is kept.
-        """
-        transform = np.eye(4)
-        transform[:2, :2] = [self.direction, [-self.direction[1], self.direction[0]]]
-        transform[:2, 3] = -transform[:2, :2] @ self.contact
-        return transform
-
-
-def plane_vector(name: str, values: Numbers) -> Float[np.ndarray, "2"]:
-    """Two finite numbers as an array of its own.
-
-    Raises:
-        ActionError: naming the vector, if the values are anything else.
-    """
-    vector = np.array(values, dtype=float)
-    if vector.shape != (2,) or not np.isfinite(vector).all():
-        raise ActionError(f"{name} {vector.tolist()}: expected two finite numbers, object frame")
-    return vector
-
-
-def sample_contacts(obj: ObjectModel, rng: np.random.Generator, per_edge: int = 2) -> list[LeverUp]:
-    """Lever-ups at uniformly sampled points of every edge (paper, section 4: two on each edge)."""
-    return [
-        LeverUp.at_edge(obj, edge, rng.uniform(np.nextafter(0.0, 1.0), 1.0))
-        for edge in range(len(obj.corners))
-        for _ in range(per_edge)
-    ]
-
-
-def sample_reachable_contacts(obj: ObjectModel, rng: np.random.Generator, count: int) -> list[LeverUp]:
-    """Lever-ups uniformly over the length of an outline, wherever a blade gets there straight from outside.
-
-    For outlines of many short edges, of which each would be too many; and for dents, of which the narrow ones have
-    no room for a blade. Nothing of the object lies more than ``BEHIND`` behind the contact.
-    """
-    starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
-    lengths = np.linalg.norm(stops - starts, axis=1)
-    outline = shapely.Polygon(obj.corners)
-    side, near, far = APPROACH
-    actions: list[LeverUp] = []
-    while len(actions) < count:
-        action = LeverUp.at_edge(
-            obj,
-            int(rng.choice(len(lengths), p=lengths / lengths.sum())),
-            rng.uniform(np.nextafter(0.0, 1.0), 1.0),
-        )
-        way = [action.contact - distance * action.direction for distance in (near, far)]
-        free = not shapely.intersects(outline, shapely.LineString(way).buffer(side, cap_style="flat"))
-        if free and ((obj.corners - action.contact) @ action.direction).min() > -BEHIND:
-            actions.append(action)
-    return actions
 
 
 @dataclass(frozen=True)
@@ -171,11 +30,11 @@ class ToolPath:
     Hogan, 1985). The motion stays in the action frame's x-z plane.
 
     Raises:
-        ActionError: if a value is out of its range.
+        ActionError: If a value is out of its range.
     """
 
     insertion: float = 0.022
-    """How far the blade tip is pushed under the object, past the contact point [m]."""
+    """Distance that the blade tip is pushed under the object, past the contact point [m]."""
     arc_radius: float = 0.14
     """Radius of the arc on which the tip is lifted [m]."""
     sweep: float = 0.75
@@ -183,7 +42,7 @@ class ToolPath:
     pitch: float = 0.28
     """Pitch of the blade while it is pushed in, tip down [rad]."""
     pitch_gain: float = 0.8
-    """By how much the pitch grows per angle of the arc."""
+    """Growth of the pitch per angle of the arc."""
     standoff: float = 0.008
     """Distance of the tip from the contact point at the start [m]."""
     clearance: float = 0.0004
@@ -211,10 +70,7 @@ class ToolPath:
             "lift_time": (0.05, 60.0),
             "hold_time": (0.0, 60.0),
         }
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ActionError(f"tool path: {name} = {value} is outside {low:g} to {high:g}")
+        check_ranges("tool path", self, limits)
 
     @property
     def duration(self) -> float:
@@ -227,13 +83,13 @@ class ToolPath:
         return self.wait_time + self.insert_time
 
     def faster(self, speed: float) -> "ToolPath":
-        """The path pushed in and lifted so many times as fast; it waits and holds as long as before.
+        """The path pushed in and lifted at a multiple of its speed; it waits and holds as long as before.
 
         Raises:
-            ActionError: if the speed is not above 0, or too much of it is asked for.
+            ActionError: If the speed is not above 0, or too high.
         """
         if not speed > 0:
-            raise ActionError(f"tool path: speed = {speed} times the usual one: give a number above 0")
+            raise ActionError(f"tool path: speed = {speed} times the nominal one: give a number above 0")
         return replace(self, insert_time=self.insert_time / speed, lift_time=self.lift_time / speed)
 
     def at(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3"]:
@@ -245,48 +101,100 @@ class ToolPath:
         Returns:
             x and z of the tip's lower edge in the action frame [m] and the blade's pitch [rad], tip down.
         """
-        inserted = _minimum_jerk((times - self.wait_time) / self.insert_time)
-        angle = self.sweep * _minimum_jerk((times - self.lift_start) / self.lift_time)
+        inserted = minimum_jerk((times - self.wait_time) / self.insert_time)
+        angle = self.sweep * minimum_jerk((times - self.lift_start) / self.lift_time)
         x = -self.standoff + (self.insertion + self.standoff) * inserted
         x = x + self.arc_radius * (1 - np.cos(angle))
         z = self.clearance + self.arc_radius * np.sin(angle)
         return np.stack([x, z, self.pitch + self.pitch_gain * angle], axis=-1)
 
-
-@dataclass(frozen=True)
-class Stroke:
-    """What may differ from one lever-up's tool path to the next: the action's parameters (paper, section 6)."""
-
-    insertion: float = ToolPath.insertion
-    """How far the blade tip is pushed under the object, past the contact point [m]."""
-    arc_radius: float = ToolPath.arc_radius
-    """Radius of the arc on which the tip is lifted [m]."""
-    sweep: float = ToolPath.sweep
-    """Angle of that arc [rad]."""
-    speed: float = 1.0
-    """Times as fast as usual the blade is pushed in and lifts."""
+    def parameters(self) -> dict[str, float]:
+        """``insertion`` [m], ``arc_radius`` [m], ``sweep`` [rad] and ``speed`` as a multiple of the nominal path's."""
+        speed = NOMINAL_TIME / (self.insert_time + self.lift_time)
+        return {
+            "insertion": self.insertion,
+            "arc_radius": self.arc_radius,
+            "sweep": self.sweep,
+            "speed": speed,
+        }
 
     @classmethod
-    def of(cls, path: ToolPath) -> "Stroke":
-        """What a path does; its speed is that of pushing in and lifting together."""
-        usual = ToolPath.insert_time + ToolPath.lift_time
-        speed = usual / (path.insert_time + path.lift_time)
-        return cls(path.insertion, path.arc_radius, path.sweep, speed)
-
-    def path(self) -> ToolPath:
-        """The usual path with these parameters.
+    def of(cls, speed: float = 1.0, **settings: Any) -> "ToolPath":
+        """The nominal path with other settings, pushed in and lifted at a multiple of its speed.
 
         Raises:
             ActionError: One of them is out of its range.
         """
-        return ToolPath(self.insertion, self.arc_radius, self.sweep).faster(self.speed)
+        return cls(**settings).faster(speed)
 
 
-USUAL_STROKE = Stroke()
-"""That of the usual path."""
+NOMINAL_TIME = ToolPath.insert_time + ToolPath.lift_time
+"""Time in which the nominal path is pushed in and lifted [s]."""
 
 
-def _minimum_jerk(phase: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    """Smooth step from 0 to 1 with zero speed and acceleration at both ends."""
-    s = np.clip(phase, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
+@dataclass(frozen=True, eq=False)
+class LeverUp(Action):
+    """A lever-up, placed on its object (paper, section 4).
+
+    Raises:
+        ActionError: If a value is not finite or the direction has no length.
+    """
+
+    label = "lever-up"
+    outcomes = tuple(str(outcome) for outcome in Outcome if outcome != FAILED)
+    path: ToolPath = ToolPath()
+    """Path of the blade's tip."""
+    tool: Screwdriver = SCREWDRIVER
+    """The screwdriver."""
+
+    @property
+    def duration(self) -> float:
+        """Time from start to end [s]."""
+        return self.path.duration
+
+    def tool_motion(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 6"]:
+        """Planned motion of the blade's tip: x, z and pitch change."""
+        coordinates = np.zeros((len(times), 6))
+        coordinates[:, [0, 2, 4]] = self.path.at(times)
+        return coordinates
+
+    def judge(self, motion: Motion, obj: ObjectModel, com: Float[np.ndarray, "time 3"]) -> Judgement:
+        """Outcome, slip and support points; the same rules for simulated and for recorded lever-ups."""
+        return judge_lever_up(motion, obj, com, self.T_action_object)
+
+    def parameters(self) -> dict[str, float]:
+        """``insertion``, ``arc_radius``, ``sweep`` and ``speed`` of the path [SI] (paper, section 6)."""
+        return self.path.parameters()
+
+
+def sample_contacts(obj: ObjectModel, rng: np.random.Generator, per_edge: int = 2) -> list[LeverUp]:
+    """Lever-ups at uniformly sampled points of every edge (paper, section 4: two on each edge)."""
+    return [
+        LeverUp.at_edge(obj, edge, rng.uniform(np.nextafter(0.0, 1.0), 1.0))
+        for edge in range(len(obj.corners))
+        for _ in range(per_edge)
+    ]
+
+
+def sample_reachable_contacts(obj: ObjectModel, rng: np.random.Generator, count: int) -> list[LeverUp]:
+    """Lever-ups uniformly over the length of an outline, wherever a blade gets there straight from outside.
+
+    For outlines of many short edges, where two at each edge would be too many, and for outlines with dents, some of
+    which are too narrow for a blade. Nothing of the object lies more than ``BEHIND`` behind the contact.
+    """
+    starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
+    lengths = np.linalg.norm(stops - starts, axis=1)
+    outline = shapely.Polygon(obj.corners)
+    side, near, far = APPROACH
+    actions: list[LeverUp] = []
+    while len(actions) < count:
+        action = LeverUp.at_edge(
+            obj,
+            int(rng.choice(len(lengths), p=lengths / lengths.sum())),
+            rng.uniform(np.nextafter(0.0, 1.0), 1.0),
+        )
+        way = [action.contact - distance * action.direction for distance in (near, far)]
+        free = not shapely.intersects(outline, shapely.LineString(way).buffer(side, cap_style="flat"))
+        if free and ((obj.corners - action.contact) @ action.direction).min() > -BEHIND:
+            actions.append(action)
+    return actions

@@ -18,14 +18,17 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
         path: Folder of the data set.
         repair: Remove leftovers, set corrupt shards aside (`foretrace simulate` makes them again), and enter
             whole shards that miss their checksum.
-        upgrade: Turn format version 1 into version 2 first.
+        upgrade: Bring a data set of format version 1 to today's format first, in place.
         out: JSON file for the description.
     """
     from foretrace.files import write_json
     from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.description import describe_dataset
     from foretrace.interactions.doctor import examine
+    from foretrace.interactions.upgrade import upgrade as upgrade_in_place
 
+    if upgrade:
+        print(f"{path}: {upgrade_in_place(path) or 'no'} interactions upgraded")
     diagnosis = examine(path, repair)
     left = sum(not finding.repaired for finding in diagnosis.findings)
     try:

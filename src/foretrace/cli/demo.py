@@ -95,7 +95,7 @@ def _new_shape(num_corners: int, seed: int) -> "tuple[Interaction, TopDownView]"
         action = LeverUp.at_edge(prism, int(rng.integers(num_corners)), float(rng.uniform(0.2, 0.8)))
         interaction = simulate_lever_up(prism, action)
         # The predictors have learned from levered objects only.
-        if interaction.effect.outcome is Outcome.LEVERED:
+        if interaction.effect.outcome == Outcome.LEVERED:
             return interaction, interaction.view
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from foretrace.actions import ToolPath
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
@@ -172,7 +173,9 @@ def predict(
             raise PredictionError(f"{', '.join(idle)} goes with --photo: give one, or leave it out")
         object, action, view, com = _object_and_action(obj, at)
     given = _given_context(asdict(context), predictor.context, compare)
-    imagined = predictor.imagine(view, context={name: given[name] for name in predictor.context}, com=com)
+    path = ToolPath.of(**{name: value for name, value in given.items() if name in PARAMETERS})
+    action, wanted = replace(action, path=path), {name: given[name] for name in predictor.context}
+    imagined = predictor.imagine(view, action, context=wanted, com=com)
     paths = {predictor.display_name: imagined.com_trajectory}
     truth = _simulate(object, action, given) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
@@ -232,13 +235,11 @@ def _given_context(
 
 
 def _simulate(obj: "ObjectModel", action: "LeverUp", given: dict[str, float]) -> "Interaction":
-    from foretrace.actions import Stroke
     from foretrace.interactions.record import Physics
     from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
     physics = Physics(**{name: value for name, value in given.items() if name in CONSTANTS})
-    stroke = Stroke(**{name: value for name, value in given.items() if name in PARAMETERS})
-    return simulate_lever_up(obj, action, SimulationConfig(physics=physics, path=stroke.path()))
+    return simulate_lever_up(obj, action, SimulationConfig(physics=physics))
 
 
 def _write_trajectory(

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli.console import say
 from foretrace.errors import RobotError
 from foretrace.robot.execution import WatchConfig
@@ -58,11 +58,10 @@ def robot(
     from foretrace.robot.kinematics import ArmKinematics
     from foretrace.robot.path import plan_lever_up, plan_retreat, read_base_pose
     from foretrace.robot.video import VideoRecorder
-    from foretrace.simulation.tool import Tool
 
     if execute and host is None:
         raise RobotError("--execute needs --host, the controller's address")
-    limits, kinematics = ArmLimits(), ArmKinematics(Tool())
+    limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
     legs = plan_lever_up(kinematics, LeverUp(contact, direction), T_table_base, path, speed)
     legs += plan_retreat(legs) if retreat else []

@@ -14,7 +14,7 @@ ROLLING_TIME = 1.5
 """Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
 
 
-@adapt((CollectConfig, ("randomisation", "tool")), (SimulationConfig, ("watch_time", "tool")))
+@adapt((CollectConfig, ("randomisation", "tool")), (SimulationConfig, ("watch_time",)))
 def simulate(
     out: Path,
     config: Annotated[OmitArgPrefixes[CollectConfig], arg(name="")],

@@ -19,7 +19,8 @@ import torch
 
 import foretrace
 from foretrace.errors import DatasetError, ResultsError
-from foretrace.interactions.storage import sole_writer, write_atomically
+from foretrace.files import flatten, sole_writer
+from foretrace.files import write_bytes as write_atomically
 from foretrace.predictor.run_folder import git_commit
 
 FORMAT = "foretrace-results"
@@ -73,7 +74,7 @@ class ResultsTable:
         self.folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
             try:
-                stack.enter_context(sole_writer(self.folder))
+                stack.enter_context(sole_writer(self.folder, DatasetError))
             except DatasetError as error:
                 raise ResultsError(str(error)) from None
             trials = finished_trials(self.folder, identity)

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from foretrace.errors import ForetraceError, ResultsError
 from foretrace.evaluation.results import Metrics, ResultsTable, Trial
-from foretrace.simulation.collect import ctrl_c_later
+from foretrace.workers import _ctrl_c_later as ctrl_c_later
 
 Work = Callable[[Trial], Metrics]
 """Carries out one trial; it travels to the workers, and what it finds must depend on the trial alone."""

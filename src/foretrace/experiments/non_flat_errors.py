@@ -27,7 +27,7 @@ from foretrace.interactions.splits import Split, split_by_object, split_by_seed
 from foretrace.objects import ObjectModel, object_from_dict
 from foretrace.predictor import EffectPredictor, OneShotPredictor, TrainConfig, train_predictor
 from foretrace.predictor.states import valid_lengths, valid_samples
-from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.lever_up import replay
 from foretrace.trajectories import mean_distance
 
 Channel = Literal["mask", "height"]
@@ -226,14 +226,11 @@ def spread_of_fates(data: NonFlatData, probes: int, seed: int = 0) -> pd.DataFra
     """
     alike = np.flatnonzero(data.kinds != "prism")
     chosen = np.sort(np.random.default_rng(seed).permutation(alike)[:probes])
-    watched = data.dataset.manifest["configuration"]["simulation"]["watch_time"]
     rows: list[dict[str, Any]] = []
     for row in chosen.tolist():
         done = data.dataset[row]
-        made = done.provenance
-        config = SimulationConfig(made.engine, made.embodiment, watch_time=watched, physics=done.physics)
         one, other = (
-            simulate_lever_up(done.object, done.action.moved(0.0, shift, 0.0), config).effect
+            replay(replace(done, action=done.action.moved(0.0, shift, 0.0))).effect
             for shift in (-NEARLY, NEARLY)
         )
         until = min(len(e.times) if e.slip_index is None else e.slip_index for e in (one, other))

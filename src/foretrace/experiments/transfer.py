@@ -24,9 +24,9 @@ from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.context import true_values
-from foretrace.simulation.collect import ctrl_c_later
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 from foretrace.trajectories import warped_distance
+from foretrace.workers import _ctrl_c_later as ctrl_c_later
 
 CM = 100.0
 
@@ -203,7 +203,7 @@ def own_error(predictor: EffectPredictor, view: TopDownView, simulated: Interact
     effect = simulated.effect
     if len(effect.times) == 0:
         return np.nan
-    known = true_values(simulated.physics, predictor.known, simulated.stroke)
+    known = true_values(simulated.physics, predictor.known, simulated.action.parameters())
     imagined = predictor.imagine(view, effect.com_trajectory[0], known).com_trajectory
     end = slice(None) if effect.slip_index is None else slice(max(1, effect.slip_index))
     return CM * warped_distance(effect.com_trajectory[end], imagined[end]).distance

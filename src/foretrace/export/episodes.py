@@ -18,7 +18,7 @@ from foretrace.predictor.base import EffectPredictor
 REST = "rest"
 """What is in no part of a training's split: of outcomes that it leaves out, or cut off by the parts' sizes."""
 MOST_LISTED = 8
-"""So many unknown ids are named; of the rest only the number is."""
+"""Most unknown ids that a message names."""
 
 
 @dataclass(frozen=True)

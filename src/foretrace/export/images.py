@@ -9,13 +9,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from foretrace.actions import Screwdriver
 from foretrace.errors import ExportError, SimulationError
 from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
 from foretrace.simulation.camera import make_renderer, render
 from foretrace.simulation.scene import body_origin, build_scene
-from foretrace.simulation.tool import Tool, add_blade
+from foretrace.simulation.tool import add_tool
 
 CAMERA = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 """The camera's intrinsics."""
@@ -67,10 +68,10 @@ def render_images(
         ExportError: The machine cannot render.
     """
     obj, pose = interaction.object, camera_pose()
-    spec = build_scene(obj, interaction.physics, Tool(), None, timestep=0.002)
+    spec = build_scene(obj, interaction.physics, Screwdriver(), None, timestep=0.002)
     body = spec.worldbody.add_body(name="tool")
     body.add_freejoint()
-    add_blade(body, Tool(), 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
+    add_tool(body, Screwdriver(), 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
     # MuJoCo's camera has y up and looks along -z.
     T_action_lens = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
     lens = matrix_to_pose(T_action_lens)

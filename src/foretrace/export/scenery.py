@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.simulation.tool import Tool
+from foretrace.actions import Screwdriver
 
 Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
@@ -31,10 +31,10 @@ class ToolPart(NamedTuple):
     colour: Colour
 
 
-SCREWDRIVER = Tool()
+SCREWDRIVER = Screwdriver()
 
 
-def tool_parts(tool: Tool = SCREWDRIVER) -> tuple[ToolPart, ToolPart, ToolPart]:
+def tool_parts(tool: Screwdriver = SCREWDRIVER) -> tuple[ToolPart, ToolPart, ToolPart]:
     """Blade, shaft and handle of a screwdriver."""
     shaft_end = -tool.blade_length - 0.5 * (tool.length - tool.blade_length)
     blade = np.array([tool.blade_length, tool.blade_width, tool.blade_thickness])

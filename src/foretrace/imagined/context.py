@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import USUAL_STROKE, LeverUp
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -44,19 +46,22 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def nominal_parameters() -> dict[str, float]:
+@cache
+def nominal_parameters() -> Mapping[str, float]:
     """Parameters of the nominal path."""
-    return asdict(USUAL_STROKE)
+    return MappingProxyType(LeverUp.nominal_parameters())
 
 
-def parameters_of(action: LeverUp) -> dict[str, float]:
-    """Parameters of an action's path, by name."""
-    return nominal_parameters()
+def parameters_of(actions: Sequence[Action]) -> dict[str, Float[np.ndarray, " n"]]:
+    """Parameters of the actions' paths, by name; NaN where an action has no such one."""
+    found = [action.parameters() for action in actions]
+    names = dict.fromkeys(name for parameters in found for name in parameters)
+    return {name: np.array([parameters.get(name, np.nan) for parameters in found]) for name in names}
 
 
 def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
     """Recorded values of one constant or parameter."""
-    return getattr(batch, name)
+    return batch.parameters.get(name, np.full(len(batch), np.nan))
 
 
 def true_context(
@@ -87,22 +92,25 @@ def recorded_context(batch: InteractionBatch, names: Sequence[str]) -> Float[np.
 
 
 def given_context(
-    names: Sequence[str], context: Mapping[str, float] | None, parameters: Mapping[str, float] | None = None
-) -> Float[np.ndarray, "1 context"]:
-    """Context of one action, in SI units.
+    names: Sequence[str],
+    context: Mapping[str, float] | None,
+    parameters: Mapping[str, Float[np.ndarray, " n"]],
+    number: int = 1,
+) -> Float[np.ndarray, "n context"]:
+    """Context of actions, in SI units.
 
     Args:
         names: The variables that the predictor is conditioned on.
-        context: Values that were given.
-        parameters: Parameters of the action's path, where the action was given; ``context`` may add to them.
+        context: Values that were given, the same for all actions.
+        parameters: Parameters of the actions' paths, where actions were given; ``context`` may add to them.
+        number: Number of actions.
 
     Raises:
-        PredictionError: A value is missing, is no finite number, contradicts the action's path, or is none that the
+        PredictionError: A value is missing, is no finite number, contradicts an action's path, or is none that the
             predictor is conditioned on.
     """
     context = {} if context is None else dict(context)
-    known = {name: value for name, value in (parameters or {}).items() if name in names} | context
-    if missing := [name for name in names if name not in known]:
+    if missing := [name for name in names if name not in parameters and name not in context]:
         wanted = ", ".join(f"{name!r}: value {CONTEXT[name]}" for name in names)
         raise PredictionError(
             f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}"
@@ -112,17 +120,18 @@ def given_context(
         raise PredictionError(
             f"the predictor is conditioned on {accepted}, not on {odd[0]!r}: leave it out of context"
         )
-    for name in names:
-        value = known[name]
+    for name, value in context.items():
         if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
             raise PredictionError(f"context {name} is {value!r}: give a finite value {CONTEXT[name]}")
-    nominal = nominal_parameters()
-    for name, value in (parameters or {}).items():
-        if name in context and not _same(value, nominal[name]) and not _same(value, context[name]):
-            raise PredictionError(
-                f"context {name} is {context[name]}, the action's path has {value}: give one of the two"
-            )
-    return np.array([[known[name] for name in names]], dtype=float).reshape(1, len(names))
+        for planned in parameters.get(name, ()):
+            if abs(planned - nominal_parameters()[name]) > SAME < abs(planned - value):
+                raise PredictionError(
+                    f"context {name} is {value}, the action's path has {planned}: give one of the two"
+                )
+    found = np.empty((number, len(names)))
+    for k, name in enumerate(names):
+        found[:, k] = context.get(name, parameters.get(name))
+    return found
 
 
 def find_unconditioned(
@@ -137,8 +146,7 @@ def find_unconditioned(
     Returns:
         The lines of each action.
     """
-    nominal = nominal_parameters()
-    number = len(next(iter(parameters.values())))
+    nominal, number = nominal_parameters(), len(next(iter(parameters.values())))
     warnings: list[list[str]] = [[] for _ in range(number)]
     for name, values in parameters.items():
         if name in names:
@@ -149,7 +157,3 @@ def find_unconditioned(
                 "conditioned on it"
             )
     return tuple(map(tuple, warnings))
-
-
-def _same(one: float, other: float) -> bool:
-    return abs(one - other) <= SAME

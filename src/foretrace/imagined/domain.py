@@ -111,7 +111,8 @@ def check_contacts(
                 f"{name}the object lies behind the contact point, its middle by {-100 * distance:.1f} cm: turn "
                 "the action's direction round"
             )
-    apart = np.linalg.norm(rim - contacts[:, None], axis=2).min(axis=1)
+    x, y = _along(rim, contacts, directions)
+    apart = np.sqrt((x * x + y * y).min(axis=1))
     apart[_look_up(mask, contacts)] = 0.0
     for name, gap in zip(names, apart, strict=True):
         if gap > LARGEST_GAP + METRES_PER_PIXEL / 2:
@@ -127,9 +128,10 @@ def check_contacts(
             f"{names[int(inside.argmax())]}the contact point lies in the object, which is still there "
             f"{100 * LARGEST_GAP:.0f} cm behind it: choose one at its rim"
         )
-    x, y = _along(rim, contacts, directions)
-    pixels = CONTACT_PIXEL[:, None, None] - np.stack([x, y]) / METRES_PER_PIXEL
-    cut = ((pixels < 0.5) | (pixels > VIEW_SIZE - 1.5)).any(axis=(0, 2))
+    cut = np.zeros(len(contacts), dtype=bool)
+    for middle, reach in zip(CONTACT_PIXEL, (x, y), strict=True):
+        cut |= middle - reach.max(axis=1) / METRES_PER_PIXEL < 0.5
+        cut |= middle - reach.min(axis=1) / METRES_PER_PIXEL > VIEW_SIZE - 1.5
     if cut.any():
         raise PredictionError(
             f"{names[int(cut.argmax())]}the object reaches beyond the view from that contact point: choose another one"
@@ -148,7 +150,7 @@ def _look_up(
 ) -> Bool[np.ndarray, " n"]:
     """Whether points [m] lie in the mask."""
     pixels = np.rint(CONTACT_PIXEL - points / METRES_PER_PIXEL).astype(int)
-    there = ((pixels >= 0) & (pixels < mask.shape)).all(axis=1)
+    there = np.all((pixels >= 0) & (pixels < mask.shape), axis=1)
     rows, columns = np.where(there[:, None], pixels, 0).T
     return there & mask[rows, columns]
 

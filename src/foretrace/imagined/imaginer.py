@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, final
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action
 from foretrace.errors import PredictionError
 from foretrace.geometry import Numbers
 from foretrace.imagined.context import (
@@ -69,7 +69,7 @@ class Imaginer(ABC):
     def imagine(
         self,
         view: TopDownView,
-        action: LeverUp | None = None,
+        action: Action | None = None,
         *,
         context: Mapping[str, float] | None = None,
         observed: Effect | ObservedMotion | None = None,
@@ -96,8 +96,8 @@ class Imaginer(ABC):
         check_view(view)
         parameters = {}
         if action is not None:
-            _check_type("action", action, LeverUp)
-            parameters = parameters_of(action)
+            _check_type("action", action, Action)
+            parameters = parameters_of([action])
         values = given_context(self.context, context, parameters)
         batch = InteractionBatch.from_views([view])
         motion = None if observed is None else observed_motion(observed)
@@ -108,7 +108,7 @@ class Imaginer(ABC):
         if motion is not None:
             self._check_observes()
             seen = motion.states(self.sample_times, start)[None]
-        return self._answer(Scenes(batch, start[None], values, seen), [parameters])[0]
+        return self._answer(Scenes(batch, start[None], values, seen), parameters)[0]
 
     @final
     def imagine_batch(
@@ -151,7 +151,7 @@ class Imaginer(ABC):
     def imagine_candidates(
         self,
         view: TopDownView,
-        actions: Iterable[LeverUp],
+        actions: Iterable[Action],
         *,
         context: Mapping[str, float] | None = None,
         com: Numbers | None = None,
@@ -177,26 +177,17 @@ class Imaginer(ABC):
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")
         for k, action in enumerate(actions):
-            _check_type(f"candidate {k}", action, LeverUp)
+            _check_type(f"candidate {k}", action, Action)
         candidates = Candidates(view, actions)
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
-        parameters = [parameters_of(action) for action in actions]
-        values = []
-        for name, known in zip(names, parameters, strict=True):
-            with _naming(name):
-                values.append(given_context(self.context, context, known))
+        parameters = parameters_of(actions)
+        values = given_context(self.context, context, parameters, len(actions))
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
-        scenes = Scenes(candidates, candidates.enter(middle), np.concatenate(values))
-        return self._answer(scenes, parameters)
+        return self._answer(Scenes(candidates, candidates.enter(middle), values), parameters)
 
-    def _answer(
-        self, scenes: Scenes, parameters: list[dict[str, float]] | dict[str, np.ndarray]
-    ) -> ImaginedBatch:
-        """What it imagines, with warnings about paths that it is not conditioned on."""
-        if isinstance(parameters, list):
-            names = parameters[0]
-            parameters = {name: np.array([values[name] for values in parameters]) for name in names}
+    def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
+        """The imagined effects, with warnings about paths that the imaginer is not conditioned on."""
         imagined = self.imagine_scenes(scenes)
         about_objects = imagined.warnings or ((),) * len(scenes)
         about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(scenes)

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
 
@@ -17,7 +17,7 @@ class Candidates:
 
     view: TopDownView
     """The object, in any action frame."""
-    actions: tuple[LeverUp, ...]
+    actions: tuple[Action, ...]
     """The actions, in that frame."""
 
     @cached_property

@@ -2,8 +2,10 @@
 
 import json
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,10 +15,10 @@ import pandas as pd
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
-from foretrace.actions import LeverUp
+from foretrace.actions import ACTIONS, FAILED, action_transform
 from foretrace.errors import DatasetError
 from foretrace.interactions import storage
-from foretrace.interactions.record import Interaction, Outcome
+from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
 
@@ -46,33 +48,25 @@ class InteractionBatch:
     length: Int[np.ndarray, " batch"]
     """Number of valid samples of each trajectory."""
     slip_index: Int[np.ndarray, " batch"]
-    """First sample off the blade after having been lifted; ``length`` where that never happened."""
+    """First sample off the tool after having been lifted; ``length`` where that never happened."""
     support_points: Float[np.ndarray, "batch 2 2"]
     """Observed support points in the action frame [m]; NaN where not observed."""
     outcome: np.ndarray
     """(batch,) array of outcome names (str)."""
-    density: Float[np.ndarray, " batch"]
-    """Density [kg/m^3]."""
-    friction: Float[np.ndarray, " batch"]
-    """Friction coefficient between object and table."""
-    tool_friction: Float[np.ndarray, " batch"]
-    """Friction coefficient between object and blade."""
-    insertion: Float[np.ndarray, " batch"]
-    """How far the blade was pushed under the object [m]."""
-    arc_radius: Float[np.ndarray, " batch"]
-    """Radius of the arc on which it was lifted [m]."""
-    sweep: Float[np.ndarray, " batch"]
-    """Angle of that arc [rad]."""
-    speed: Float[np.ndarray, " batch"]
-    """Times as fast as usual it moved."""
+    parameters: dict[str, np.ndarray]
+    """(batch,) arrays by name [SI]: physical constants as in `Physics`, and parameters of the actions; NaN where an
+    interaction has no such one."""
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def __getitem__(self, rows: Any) -> "InteractionBatch":
         """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all."""
-        kept = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "times"}
-        return replace(self, **kept)
+        kept = {
+            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("times", "parameters")
+        }
+        parameters = {name: values[rows] for name, values in self.parameters.items()}
+        return replace(self, **kept, parameters=parameters)
 
     @classmethod
     def from_interactions(cls, interactions: Sequence[Interaction]) -> "InteractionBatch":
@@ -97,7 +91,7 @@ class InteractionBatch:
         times: Float[np.ndarray, " time"] | None = None,
         corners: Sequence[Float[np.ndarray, "_ 2"]] | None = None,
     ) -> "InteractionBatch":
-        """Actions whose effect is still to be imagined: everything that was not seen is NaN, or empty.
+        """Actions whose effect is still to be imagined: everything that was not observed is NaN, or empty.
 
         Args:
             views: What the camera sees of each object, in the action frame.
@@ -105,7 +99,6 @@ class InteractionBatch:
             corners: Corners of each object in the action frame [m], if known.
         """
         n, times = len(views), np.zeros(0) if times is None else times
-        unknown = np.full(n, np.nan)
         corners = [np.zeros((0, 2))] * n if corners is None else corners
         return cls(
             ids=np.arange(n),
@@ -120,8 +113,8 @@ class InteractionBatch:
             length=np.zeros(n, dtype=np.int64),
             slip_index=np.zeros(n, dtype=np.int64),
             support_points=np.full((n, 2, 2), np.nan),
-            outcome=np.full(n, "", dtype="<U8"),
-            **dict.fromkeys(_CONSTANTS, unknown),
+            outcome=_outcome_array([""] * n),
+            parameters={},
         )
 
 
@@ -162,7 +155,7 @@ class Dataset:
                 stacklevel=2,
             )
         dataset = cls(pa.concat_tables([storage.SCHEMA.empty_table(), *tables]), manifest, path)
-        return dataset if failed else dataset.where(outcome=[o for o in Outcome if o != Outcome.FAILED])
+        return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
 
     def __len__(self) -> int:
         return self.table.num_rows
@@ -182,23 +175,26 @@ class Dataset:
         """The interactions that meet every condition.
 
         Args:
-            **conditions: For a column (``outcome``, ``num_corners``, ``object_id``...): the value that it
-                must have, several allowed values, or a function from the column (an array) to booleans.
+            **conditions: For a column (``outcome``, ``num_corners``, ``object_id``...) or a parameter of the
+                actions (``insertion``...): the value that it must have, several allowed values, or a function from
+                the column (an array) to booleans.
 
         Raises:
-            DatasetError: There is no such column.
+            DatasetError: There is no such column, or no such outcome.
         """
         kept = np.ones(len(self), dtype=bool)
         for name, wanted in conditions.items():
-            scalars = [f.name for f in storage.SCHEMA if not pa.types.is_nested(f.type)]
-            if name not in scalars:
-                raise DatasetError(f"no column {name!r} to filter by; there are {', '.join(scalars)}")
-            column = self.table[name].to_numpy()
+            column = self._column(name)
             if callable(wanted):
                 kept &= np.asarray(wanted(column), dtype=bool)
-            else:
-                several = isinstance(wanted, list | tuple | set | frozenset | range | np.ndarray)
-                kept &= np.isin(column, list(wanted) if several else [wanted])
+                continue
+            several = isinstance(wanted, list | tuple | set | frozenset | range | np.ndarray)
+            values = list(wanted) if several else [wanted]
+            if name == "outcome" and (
+                odd := [value for value in values if value not in self._outcome_names()]
+            ):
+                raise DatasetError(f"no outcome {odd[0]!r}: choose from {', '.join(self._outcome_names())}")
+            kept &= np.isin(column, values)
         return self if kept.all() else self._view(np.flatnonzero(kept))
 
     def with_id(self, id: int) -> Interaction:
@@ -227,9 +223,31 @@ class Dataset:
         return self.table.to_pandas()
 
     def outcomes(self) -> dict[str, int]:
-        """How often each outcome occurs, in the order of `Outcome`."""
-        names = self.table["outcome"].to_pylist()
-        return {str(outcome): names.count(outcome) for outcome in Outcome if outcome in names}
+        """Number of interactions with each outcome that occurs, in the order in which actions name them."""
+        return count_outcomes(self.table["outcome"].to_pylist())
+
+    def _outcome_names(self) -> list[str]:
+        """Outcomes that its actions can have, and any other that it holds."""
+        known = [
+            name
+            for label in self.table["action"].unique().to_pylist()
+            for name in ACTIONS.find(label).outcomes
+        ]
+        return list(dict.fromkeys([*known, FAILED, *self.table["outcome"].unique().to_pylist()]))
+
+    def _column(self, name: str) -> np.ndarray:
+        """A column of single values, or a parameter of the actions."""
+        scalars = [f.name for f in storage.SCHEMA if not pa.types.is_nested(f.type)]
+        if name in scalars:
+            return self.table[name].to_numpy()
+        if name not in self._parameters:
+            names = ", ".join([*scalars, *self._parameters])
+            raise DatasetError(f"no column {name!r} to filter by; there are {names}")
+        return self._parameters[name]
+
+    @cached_property
+    def _parameters(self) -> dict[str, np.ndarray]:
+        return storage.parameter_values(self.table)
 
     def _view(self, rows: np.ndarray) -> "Dataset":
         view = Dataset(self.table.take(pa.array(rows, type=pa.int64())), self.manifest, self.path)
@@ -242,9 +260,19 @@ class Dataset:
         return self._objects[description]
 
 
-_CONSTANTS = ("density", "friction", "tool_friction", *storage.STROKE_COLUMNS)
-"""Columns of one number that a predictor may be told."""
+def count_outcomes(outcomes: Sequence[str]) -> dict[str, int]:
+    """Number of times that each outcome occurs, in the order in which actions name them."""
+    counts = Counter(map(str, outcomes))
+    known = [str(name) for action in ACTIONS.values() for name in action.outcomes]
+    return {name: counts[name] for name in dict.fromkeys([*known, FAILED, *counts]) if counts[name]}
+
+
 _VIEW_SHAPE = (storage.VIEW_SIZE, storage.VIEW_SIZE)
+
+
+def _outcome_array(outcomes: Sequence[str]) -> np.ndarray:
+    """Names as an array whose width, and so its bytes, does not depend on which of a lever-up's outcomes occur."""
+    return np.array(outcomes, dtype=f"<U{max(8, *map(len, outcomes), 0)}")
 
 
 def _padded(arrays: Sequence[np.ndarray], width: int, longest: int | None = None) -> np.ndarray:
@@ -279,7 +307,9 @@ def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> l
     corners = []
     columns = (table[name].to_pylist() for name in ("object", "contact", "direction"))
     for description, contact, direction in zip(*columns, strict=True):
-        T_action_object = LeverUp(np.array(contact), np.array(direction)).T_action_object
+        unit = np.array(direction)
+        # Dividing by a length of almost 1 again keeps features as they have always been, to the last bit.
+        T_action_object = action_transform(np.array(contact), unit / np.linalg.norm(unit))
         corners.append(objects[description].corners @ T_action_object[:2, :2].T + T_action_object[:2, 3])
     return corners
 
@@ -288,7 +318,7 @@ def _batch(table: pa.Table, objects: Mapping[str, ObjectModel]) -> InteractionBa
     times, length = _common_times(table)
     corners = _corners_in_action(table, objects)
     slip_index = table["slip_index"].to_numpy()
-    constants = {name: table[name].to_numpy() for name in _CONSTANTS}
+    constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
     return InteractionBatch(
         ids=table["id"].to_numpy(),
         mask=storage.unpack_masks(table["mask"].to_pylist()),
@@ -302,6 +332,6 @@ def _batch(table: pa.Table, objects: Mapping[str, ObjectModel]) -> InteractionBa
         length=length,
         slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
         support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
-        outcome=np.array(table["outcome"].to_pylist(), dtype="<U8"),
-        **constants,
+        outcome=_outcome_array(table["outcome"].to_pylist()),
+        parameters=constants | storage.parameter_values(table),
     )

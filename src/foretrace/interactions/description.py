@@ -8,14 +8,11 @@ import numpy as np
 from foretrace.geometry import quaternion_to_matrix, support_edge, tilt
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
-from foretrace.interactions.storage import STROKE_COLUMNS
+from foretrace.interactions.storage import parameter_values
 
 CM, MM = 100.0, 1000.0
-VARIABLE = (
-    *("density", "friction", "tool_friction", "misplaced_ahead", "misplaced_left", "misplaced_turn"),
-    *STROKE_COLUMNS,
-)
-"""Columns that may be drawn anew for every interaction."""
+VARIABLE = ("density", "friction", "tool_friction", "execution_ahead", "execution_left", "execution_turn")
+"""Columns that may be drawn anew for every interaction, as well as the actions' parameters."""
 
 
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
@@ -26,7 +23,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
 
     Returns:
         ``outcomes`` (counts), ``outcomes_by_kind`` (the same for each kind of object), ``interactions``, ``varies``
-        (least and greatest value of what is not the same in all interactions: constants, misplacement, height and
+        (least and greatest value of what is not the same in all interactions: constants, execution error, height and
         bevel; SI units),
         ``fell_off_the_table`` (count), ``median_rolled_cm`` (distance that the rolled ones went, if there are any), and
         for the levered ones: ``median_final_tilt_deg``,
@@ -35,7 +32,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         observed support corners) and ``rule_agreement`` (share of those whose corners the closed-form rule of
         ``geometry.support_edge`` names).
     """
-    levered = dataset.where(outcome=str(Outcome.LEVERED))
+    levered = dataset[dataset.table["outcome"].to_numpy() == Outcome.LEVERED]
     rows = [_describe(levered[k]) for k in range(len(levered))]
     objects = [json.loads(text) for text in dataset.table["object"].to_pylist()]
     kinds = np.array([obj["kind"] for obj in objects])
@@ -46,7 +43,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         "varies": _ranges(dataset, objects),
         "fell_off_the_table": dataset.table["fall_index"].drop_null().length(),
     }
-    if rolled := list(dataset.where(outcome=str(Outcome.ROLLED))):
+    if rolled := list(dataset[dataset.table["outcome"].to_numpy() == Outcome.ROLLED]):
         paths = [interaction.effect.com_trajectory[:, :2] for interaction in rolled]
         distances = [np.linalg.norm(path[-1] - path[0]) for path in paths]
         figures["median_rolled_cm"] = float(CM * np.median(distances))
@@ -65,7 +62,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
 
 def _ranges(dataset: Dataset, objects: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
     """Least and greatest value of each quantity that is not the same in all interactions."""
-    columns = {name: dataset.table[name].to_numpy() for name in VARIABLE}
+    columns = {name: dataset.table[name].to_numpy() for name in VARIABLE} | parameter_values(dataset.table)
     columns["height"] = np.array([obj["height"] for obj in objects if "height" in obj])
     bevels = np.array([obj["bevel"] for obj in objects if "bevel" in obj]).reshape(-1, 2)
     columns["bevel_width"], columns["bevel_height"] = bevels.T

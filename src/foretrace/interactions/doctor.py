@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from foretrace.errors import DatasetError
+from foretrace.actions import FAILED, ToolPath
+from foretrace.errors import ActionError, DatasetError
+from foretrace.files import partial_files, sole_writer
 from foretrace.interactions import storage
-from foretrace.interactions.record import Outcome
+from foretrace.interactions.dataset import count_outcomes
 
 QUATERNION_TOLERANCE = 1e-6
 
@@ -53,7 +55,7 @@ def examine(path: str | Path, repair: bool = False) -> Diagnosis:
     if not repair:
         return _examine(path, repair=False)
     storage.read_manifest(path)  # before the lock, which would leave its file in any folder
-    with storage.sole_writer(path):
+    with sole_writer(path, DatasetError):
         return _examine(path, repair=True)
 
 
@@ -80,12 +82,11 @@ def _examine(path: Path, repair: bool) -> Diagnosis:
     if repair:
         storage.write_manifest(path, manifest)
     outcomes = [outcome for table in tables.values() for outcome in table["outcome"].to_pylist()]
-    counts = {str(outcome): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
-    return Diagnosis(tuple(findings), len(outcomes), counts)
+    return Diagnosis(tuple(findings), len(outcomes), count_outcomes(outcomes))
 
 
 def _stray_files(path: Path, repair: bool) -> Iterator[Finding]:
-    for file in sorted([*path.glob("*.tmp"), *(path / storage.SHARD_FOLDER).glob("*.tmp")]):
+    for file in [*partial_files(path), *partial_files(path / storage.SHARD_FOLDER)]:
         if repair:
             file.unlink()
         yield Finding(str(file.relative_to(path)), "temporary file of an interrupted run", repair)
@@ -108,14 +109,20 @@ def _unsound_numbers(name: str, table: pa.Table) -> Iterator[Finding]:
         if pa.types.is_floating(f.type) and f.name not in storage.OPTIONAL_COLUMNS
     ]
     columns = [*storage.TRAJECTORIES, "joint_trajectory", "num_joints", "id", "outcome", *scalars]
+    columns += storage.ACTION_COLUMNS
     for row in table.select(columns).to_pylist():
         who = f"interaction {row['id']}"
         num_samples = len(row["times"])
         widths = {**storage.TRAJECTORIES, "joint_trajectory": row["num_joints"]}
-        if num_samples == 0 and row["outcome"] != Outcome.FAILED:
+        if num_samples == 0 and row["outcome"] != FAILED:
             yield Finding(name, f"{who} has no samples although its outcome is {row['outcome']}")
-        if row["outcome"] not in list(Outcome):
-            yield Finding(name, f"{who} has the unknown outcome {row['outcome']!r}")
+        try:
+            outcomes = storage.decode_action(row).outcomes
+        except ActionError as error:
+            yield Finding(name, f"{who}: {error}")
+        else:
+            if row["outcome"] not in (*outcomes, FAILED):
+                yield Finding(name, f"{who} has the unknown outcome {row['outcome']!r}")
         for column, width in widths.items():
             values = np.array(row[column], dtype=float)
             if len(values) != num_samples * width:
@@ -135,11 +142,19 @@ def _unsound_numbers(name: str, table: pa.Table) -> Iterator[Finding]:
 
 def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Finding]:
     """What is drawn anew for every interaction, outside of the range that the configuration gives."""
-    for column, drawn in (manifest["configuration"].get("randomisation") or {}).items():
-        if column not in table.column_names or drawn is None:
-            continue
+    ranges = manifest["configuration"].get("randomisation") or {}
+    ranges = {column: drawn for column, drawn in ranges.items() if drawn is not None}
+    columns = {column: table[column].to_numpy() for column in ranges if column in table.column_names}
+    try:
+        columns |= storage.parameter_values(table)
+        nominal = ToolPath(**manifest["configuration"].get("path", {})).parameters()["speed"]
+    except (ActionError, TypeError):
+        return  # reported with the numbers
+    for column in ranges.keys() & columns.keys():
+        drawn, values = ranges[column], columns[column]
         low, high = (-drawn, drawn) if isinstance(drawn, int | float) else drawn
-        values = table[column].to_numpy()
+        if column == "speed":  # drawn as a multiple of the configured path's
+            values = np.round(values / nominal, 9)
         for row in np.flatnonzero((values < low) | (values > high)):
             who = f"interaction {table['id'][int(row)]}"
             yield Finding(name, f"{who}: {column} = {values[row]:g} was not drawn from {low:g} to {high:g}")

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from foretrace.errors import DatasetError
-from foretrace.files import read_json
+from foretrace.files import read_json, short_hash, sole_writer, write_json
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 
 CONFIGURATION = {"source": "recorded"}
+OBJECTS = "objects"
+"""Entry of the manifest with the number of each object, by the hash of its description."""
 NOTES_FOLDER = "recordings"
 """Folder with a JSON file for each interaction: its camera, and how well it was seen."""
-
-
 NOTED = {
     "recording": str,
     "camera": dict,
@@ -57,7 +57,7 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
         raise DatasetError(f"{folder} is no data set and not empty: choose a new folder")
     (folder / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
     (folder / NOTES_FOLDER).mkdir(exist_ok=True)
-    with storage.sole_writer(folder):
+    with sole_writer(folder, DatasetError):
         if (folder / storage.MANIFEST).is_file():
             manifest = storage.read_manifest(folder)
         else:
@@ -67,17 +67,19 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
                 f"{folder} holds simulated interactions: keep recordings in a folder of their own"
             )
         id = manifest["num_trials"]
+        objects = manifest.setdefault(OBJECTS, {})
         described = json.dumps(interaction.object.to_dict())
-        known: dict[str, int] = {}
-        for name, entry in manifest["shards"].items():
-            table, _ = storage.read_shard(folder, name, entry.get("sha256"))
-            known |= dict(zip(table["object"].to_pylist(), table["object_id"].to_pylist(), strict=True))
-        object_id = known.get(described, len(set(known.values())))
+        object_id = objects.setdefault(short_hash(described.encode()), len(objects))
         table = storage.to_table([storage.encode(replace(interaction, id=id), object_id)])
         path = folder / NOTES_FOLDER / f"{id:05d}.json"
-        storage.write_atomically(path, json.dumps(dict(notes), indent=1).encode())
+        write_json(path, dict(notes))
         name = storage.shard_name(id)
         manifest["shards"][name] = storage.write_shard(folder, name, table)
         manifest["num_trials"] = id + 1
         storage.write_manifest(folder, manifest)
     return id
+
+
+def numbered(objects: Mapping[str, int]) -> dict[str, int]:
+    """The manifest's entry `OBJECTS` from numbers of objects by their descriptions."""
+    return {short_hash(description.encode()): number for description, number in objects.items()}

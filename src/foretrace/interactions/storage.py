@@ -7,9 +7,7 @@ Positions and angles are kept as float64, exactly as observed; the height map in
 
 import hashlib
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -18,17 +16,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from foretrace.actions import USUAL_STROKE, LeverUp, Stroke
+from foretrace.actions import FAILED, Action
 from foretrace.errors import DatasetError
-from foretrace.interactions.record import Effect, Interaction, Misplacement, Outcome, Physics, Provenance
+from foretrace.files import read_versioned, write_bytes, write_json
+from foretrace.interactions.record import Effect, ExecutionOffset, Interaction, Physics, Provenance
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
 
 FORMAT = "foretrace-interactions"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST = "manifest.json"
 SHARD_FOLDER = "shards"
-LOCK = ".lock"
 HEIGHT_STEP = 1e-4
 """Resolution of stored height maps [m]."""
 
@@ -38,58 +36,60 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "object_id": (pa.int64(), "", "equal numbers are the same object; its thickness and bevel may vary"),
     "num_corners": (pa.int64(), "", "corners of the object's outline"),
     "object": (pa.string(), "m", "the object in its own frame, as JSON"),
+    "action": (pa.string(), "", "label of the commanded action"),
     "contact": (_FLOATS, "m", "contact point in the object frame (2)"),
     "direction": (_FLOATS, "", "unit direction of the action in the object frame (2)"),
+    "path": (pa.string(), "SI", "parameters of the tool's path, as JSON"),
+    "tool": (pa.string(), "m", "the tool and its dimensions, as JSON"),
     "outcome": (pa.string(), "", "what became of the object"),
-    "slip_index": (pa.int64(), "", "first sample off the blade after having been lifted, or null"),
+    "slip_index": (pa.int64(), "", "first sample off the tool after having been lifted, or null"),
     "fall_index": (pa.int64(), "", "first sample falling off the table, or null"),
     "times": (_FLOATS, "s", "sample times"),
     "pose_trajectory": (_FLOATS, "m", "object frame: position, quaternion w x y z (time x 7)"),
     "com_trajectory": (_FLOATS, "m", "centre of mass (time x 3)"),
-    "tool_trajectory": (_FLOATS, "m", "blade tip: position, quaternion w x y z (time x 7)"),
+    "tool_trajectory": (_FLOATS, "m", "tool frame, at its tip: position, quaternion w x y z (time x 7)"),
     "joint_trajectory": (_FLOATS, "rad", "joint angles (time x num_joints)"),
     "num_joints": (pa.int64(), "", "columns of joint_trajectory, 0 when the tool moved alone"),
     "support_points": (_FLOATS, "m", "the two corners turned about (2 x 2), NaN where not observed"),
     "support_corners": (pa.list_(pa.int64()), "", "indices of the corners that stood on the table"),
-    "path_error": (pa.float64(), "m", "largest distance of the blade tip from its planned path"),
+    "path_error": (pa.float64(), "m", "largest distance of the tool's tip from its planned path"),
     "mask": (pa.binary(), "", "top-down mask, bits packed row by row"),
     "height": (pa.binary(), "0.1 mm", "top-down height map, little-endian uint16 row by row"),
     "metres_per_pixel": (pa.float64(), "m", "scale of mask and height"),
     "density": (pa.float64(), "kg/m^3", "density of the object"),
     "friction": (pa.float64(), "", "friction coefficient between object and table"),
-    "tool_friction": (pa.float64(), "", "friction coefficient between object and blade"),
+    "tool_friction": (pa.float64(), "", "friction coefficient between object and tool"),
     "rolling_friction": (pa.float64(), "m", "lever arm of the resistance to rolling of a round object"),
     "table_edge": (pa.float64(), "m", "distance of the table's edge ahead of the contact point, or null"),
-    "misplaced_ahead": (pa.float64(), "m", "how far ahead of the told contact the blade acted"),
-    "misplaced_left": (pa.float64(), "m", "how far to the left of it"),
-    "misplaced_turn": (pa.float64(), "rad", "by how much the blade pointed to the left of what was told"),
-    "insertion": (pa.float64(), "m", "how far the blade was pushed under the object"),
-    "arc_radius": (pa.float64(), "m", "radius of the arc on which the blade was lifted"),
-    "sweep": (pa.float64(), "rad", "angle of that arc"),
-    "speed": (pa.float64(), "", "times as fast as usual the blade was pushed in and lifted"),
+    "execution_ahead": (pa.float64(), "m", "distance of the executed contact ahead of the commanded one"),
+    "execution_left": (
+        pa.float64(),
+        "m",
+        "distance of the executed contact to the left of the commanded one",
+    ),
+    "execution_turn": (
+        pa.float64(),
+        "rad",
+        "angle of the executed direction to the left of the commanded one",
+    ),
     "source": (pa.string(), "", "simulated or recorded"),
     "engine": (pa.string(), "", "physics engine, empty for a recording"),
     "embodiment": (pa.string(), "", "arm or tool"),
+    "camera": (pa.string(), "", "how the view was made: exact, rgbd or recorded"),
     "seed": (pa.int64(), "", "seed of this interaction's random draws"),
+    "timestep": (pa.float64(), "s", "time step of the simulation, 0 for a recording"),
+    "sample_period": (pa.float64(), "s", "time between samples"),
+    "watch_time": (pa.float64(), "s", "time of observation after the end of the tool's path"),
     "versions": (pa.string(), "", "versions that shaped the numbers, as JSON"),
 }
 """Every column: type, unit, meaning. Vectors are in the action frame unless their meaning says otherwise."""
-ADDED_COLUMNS: dict[str, Any] = {
-    "fall_index": None,
-    "rolling_friction": Physics.rolling_friction,
-    "table_edge": None,
-    "misplaced_ahead": 0.0,
-    "misplaced_left": 0.0,
-    "misplaced_turn": 0.0,
-    **asdict(USUAL_STROKE),
-}
-"""Columns that older data sets lack, and what they would hold there."""
 OPTIONAL_COLUMNS = ("slip_index", "fall_index", "table_edge")
 """Numbers that may be null."""
 PHYSICS_COLUMNS = tuple(field.name for field in fields(Physics))
-STROKE_COLUMNS = tuple(field.name for field in fields(Stroke))
-MISPLACED = "misplaced_"
-"""How the columns of a `Misplacement` begin."""
+ACTION_COLUMNS = ("action", "contact", "direction", "path", "tool")
+PROVENANCE_COLUMNS = tuple(field.name for field in fields(Provenance) if field.name != "versions")
+EXECUTION = "execution_"
+"""Beginning of the columns of an `ExecutionOffset`."""
 SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
 TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
 """Numbers per sample of each trajectory column; the joints' count is a column of its own."""
@@ -103,14 +103,17 @@ def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
         object_id: Number of its object; equal numbers are the same object.
     """
     effect, action, view = interaction.effect, interaction.action, interaction.view
-    kept = slice(0, 0) if effect.outcome == Outcome.FAILED else slice(None)
+    kept = slice(0, 0) if effect.outcome == FAILED else slice(None)
     return {
         "id": interaction.id,
         "object_id": object_id,
         "num_corners": len(interaction.object.corners),
         "object": json.dumps(interaction.object.to_dict()),
-        "contact": np.asarray(action.contact, dtype=float),
-        "direction": np.asarray(action.direction, dtype=float),
+        "action": action.label,
+        "contact": action.contact,
+        "direction": action.direction,
+        "path": json.dumps(asdict(action.path)),
+        "tool": json.dumps(action.tool.to_dict()),
         "outcome": str(effect.outcome),
         "slip_index": effect.slip_index,
         "fall_index": effect.fall_index,
@@ -123,8 +126,7 @@ def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
         "height": np.rint(np.clip(view.height / HEIGHT_STEP, 0, 65535)).astype("<u2").tobytes(),
         "metres_per_pixel": view.metres_per_pixel,
         **asdict(interaction.physics),
-        **{MISPLACED + name: value for name, value in asdict(interaction.misplacement).items()},
-        **asdict(interaction.stroke),
+        **{EXECUTION + name: value for name, value in asdict(interaction.execution_error).items()},
         **asdict(interaction.provenance),
         "versions": json.dumps(interaction.provenance.versions, sort_keys=True),
     }
@@ -140,14 +142,14 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
         joint_trajectory=np.array(row["joint_trajectory"], float).reshape(len(times), row["num_joints"]),
         support_points=np.array(row["support_points"], float).reshape(2, 2),
         support_corners=tuple(row["support_corners"]),
-        outcome=Outcome(row["outcome"]),
+        outcome=row["outcome"],
         slip_index=row["slip_index"],
         fall_index=row["fall_index"],
         path_error=row["path_error"],
     )
     return Interaction(
         object=known_object if known_object is not None else object_from_dict(json.loads(row["object"])),
-        action=LeverUp(contact=np.array(row["contact"]), direction=np.array(row["direction"])),
+        action=decode_action(row),
         view=TopDownView(
             mask=unpack_masks([row["mask"]])[0],
             height=unpack_heights([row["height"]])[0],
@@ -156,13 +158,42 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
         effect=effect,
         physics=Physics(**{name: row[name] for name in PHYSICS_COLUMNS}),
         provenance=Provenance(
-            **{name: row[name] for name in ("source", "engine", "embodiment", "seed")},
-            versions=json.loads(row["versions"]),
+            **{name: row[name] for name in PROVENANCE_COLUMNS}, versions=json.loads(row["versions"])
         ),
-        misplacement=Misplacement(**{f.name: row[MISPLACED + f.name] for f in fields(Misplacement)}),
-        stroke=Stroke(**{name: row[name] for name in STROKE_COLUMNS}),
+        execution_error=ExecutionOffset(**{f.name: row[EXECUTION + f.name] for f in fields(ExecutionOffset)}),
         id=row["id"],
     )
+
+
+def decode_action(row: Mapping[str, Any]) -> Action:
+    """The commanded action in one row."""
+    path, tool = json.loads(row["path"]), json.loads(row["tool"])
+    return Action.from_dict(
+        {
+            "label": row["action"],
+            "contact": row["contact"],
+            "direction": row["direction"],
+            "path": path,
+            "tool": tool,
+        }
+    )
+
+
+def parameter_values(table: pa.Table) -> dict[str, np.ndarray]:
+    """Parameters of the actions in a table by name [SI], one number a row; NaN where an action lacks one."""
+    kinds = list(zip(*(table[name].to_pylist() for name in ("action", "path", "tool")), strict=True))
+    place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
+    numbers = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
+    found = [
+        decode_action({"action": action, "path": path, "tool": tool, **place}).parameters()
+        for action, path, tool in numbers
+    ]
+    rows = [numbers[kind] for kind in kinds]
+    names = dict.fromkeys(name for parameters in found for name in parameters)
+    return {
+        name: np.array([parameters.get(name, np.nan) for parameters in found], dtype=float)[rows]
+        for name in names
+    }
 
 
 def unpack_masks(packed: Sequence[bytes]) -> np.ndarray:
@@ -189,44 +220,12 @@ def shard_name(index: int) -> str:
     return f"{SHARD_FOLDER}/shard-{index:05d}.parquet"
 
 
-@contextmanager
-def sole_writer(folder: Path) -> Iterator[None]:
-    """Hold the data set's lock, which the system releases even when the process is killed.
-
-    Raises:
-        DatasetError: Another process is writing there.
-    """
-    with open(folder / LOCK, "w") as lock:
-        if os.name == "posix":
-            import fcntl
-
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise DatasetError(f"another foretrace writes to {folder}; wait until it is done") from error
-        yield
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is either whole or not there, even if the machine loses power."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    if os.name == "posix":  # the new name itself must reach the disk too
-        folder = os.open(path.parent, os.O_RDONLY)
-        os.fsync(folder)
-        os.close(folder)
-
-
 def write_shard(folder: Path, name: str, table: pa.Table) -> dict[str, Any]:
     """Write one shard; returns its entry for the manifest (checksum and number of rows)."""
     buffer = pa.BufferOutputStream()
     pq.write_table(table.combine_chunks(), buffer, compression="zstd", use_dictionary=False)
     content = buffer.getvalue().to_pybytes()
-    write_atomically(folder / name, content)
+    write_bytes(folder / name, content)
     return shard_entry(content, table)
 
 
@@ -235,19 +234,22 @@ def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
     return {"sha256": hashlib.sha256(content).hexdigest(), "rows": table.num_rows}
 
 
-def read_shard(folder: Path, name: str, sha256: str | None = None) -> tuple[pa.Table, bytes]:
+def read_shard(
+    folder: Path, name: str, sha256: str | None = None, schema: pa.Schema | None = SCHEMA
+) -> tuple[pa.Table, bytes]:
     """A shard as a table, and its bytes.
 
     Args:
         folder: The data set's folder.
         name: The shard's name in the manifest.
         sha256: The checksum that it must have, or None to accept any.
+        schema: The schema that it must have, or None to accept any.
 
     Raises:
         DatasetError: The file is missing, damaged, or of another schema.
     """
     path = folder / name
-    remedy = f"`foretrace doctor {folder} --repair` sets it aside, then `foretrace simulate` makes it again"
+    remedy = f"`foretrace data {folder} --repair` sets it aside, then `foretrace simulate` makes it again"
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -260,22 +262,11 @@ def read_shard(folder: Path, name: str, sha256: str | None = None) -> tuple[pa.T
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error
-    table = _with_added_columns(table)
-    if not table.schema.equals(SCHEMA):
-        found, wanted = ({field.name: field.type for field in schema} for schema in (table.schema, SCHEMA))
+    if schema is not None and not table.schema.equals(schema):
+        found, wanted = ({field.name: field.type for field in each} for each in (table.schema, schema))
         odd = ", ".join(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
         raise DatasetError(f"shard {path} has another schema (differs in {odd}); {remedy}")
     return table, content
-
-
-def _with_added_columns(table: pa.Table) -> pa.Table:
-    """A table of an older data set with the columns that have been added since, in today's order."""
-    for name, value in ADDED_COLUMNS.items():
-        if name not in table.column_names:
-            values = pa.array([value] * table.num_rows, type=SCHEMA.field(name).type)
-            table = table.append_column(SCHEMA.field(name), values)
-    known = set(table.column_names) == set(SCHEMA.names) and len(table.column_names) == len(SCHEMA)
-    return table.select(SCHEMA.names) if known else table
 
 
 def new_manifest(
@@ -306,11 +297,15 @@ def new_manifest(
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Replace the manifest, atomically."""
-    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+    write_json(folder / MANIFEST, manifest)
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
     """The manifest of a data set.
+
+    Args:
+        folder: The data set's folder.
+        older: Older format versions that are accepted as well.
 
     Raises:
         DatasetError: No data set is there, its manifest is damaged, or it is of another format version.
@@ -321,19 +316,16 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise DatasetError(f"no data set at {folder}: no such folder; {remedy}")
     if not path.is_file():
         raise DatasetError(f"{folder} is not a data set: it has no {MANIFEST}; {remedy}")
-    try:
-        manifest = json.loads(path.read_text())
-        version = manifest["format_version"]
-        complete = manifest["format"] == FORMAT and isinstance(manifest["shards"], dict)
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path} is damaged ({error!r}); simulate again into a new folder") from error
-    if version != FORMAT_VERSION:
+    remedy = "simulate again into a new folder"
+    manifest = read_versioned(path, FORMAT, FORMAT_VERSION, DatasetError, remedy, older=(1,))
+    if manifest["format_version"] not in (FORMAT_VERSION, *older):
         raise DatasetError(
-            f"{path} has format version {version}, this foretrace reads version {FORMAT_VERSION}: "
-            "use the foretrace that wrote it, or simulate again into a new folder"
+            f"{path} has format version {manifest['format_version']}, this foretrace reads version {FORMAT_VERSION}: "
+            f"upgrade it in place with `foretrace data {folder} --upgrade`"
         )
-    if not complete:
-        raise DatasetError(f"{path} is not a manifest of {FORMAT}")
+    for name, kind in (("shards", dict), ("configuration", dict), ("num_trials", int), ("shard_size", int)):
+        if not isinstance(manifest.get(name), kind):
+            raise DatasetError(f"{path} is damaged (its {name} is {manifest.get(name)!r}); {remedy}")
     return manifest
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import ActionError, ShapeError, ViewError
 from foretrace.geometry import Numbers, mask_outline
 from foretrace.objects import ObjectModel, read_silhouette, silhouette_origin
@@ -63,7 +63,7 @@ class TopDownView:
             values.setflags(write=False)
 
     @classmethod
-    def of(cls, obj: ObjectModel, action: LeverUp) -> "TopDownView":
+    def of(cls, obj: ObjectModel, action: Action) -> "TopDownView":
         """The exact view of a known object: a pixel shows what lies at its centre.
 
         Raises:
@@ -152,7 +152,7 @@ class TopDownView:
         height = np.where(count.reshape(VIEW_SIZE, VIEW_SIZE) == 0, closed, height)
         return cls(height > 0, height)
 
-    def seen_from(self, action: LeverUp) -> "TopDownView":
+    def seen_from(self, action: Action) -> "TopDownView":
         """The object as seen in the frame of another action; parts beyond this view stay unseen.
 
         Args:
@@ -208,12 +208,12 @@ def _pixel_centres() -> Float[np.ndarray, "128 128 2"]:
     return _metres_of(grid.astype(float))
 
 
-def _to_action(points: Float[np.ndarray, "k 2"], action: LeverUp) -> Float[np.ndarray, "k 2"]:
+def _to_action(points: Float[np.ndarray, "k 2"], action: Action) -> Float[np.ndarray, "k 2"]:
     transform = action.T_action_object
     return points @ transform[:2, :2].T + transform[:2, 3]
 
 
-def _to_object(points: Float[np.ndarray, "k 2"], action: LeverUp) -> Float[np.ndarray, "k 2"]:
+def _to_object(points: Float[np.ndarray, "k 2"], action: Action) -> Float[np.ndarray, "k 2"]:
     return points @ action.T_action_object[:2, :2] + action.contact
 
 

@@ -2,13 +2,13 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from foretrace.actions import LeverUp, Stroke, ToolPath
+from foretrace.actions import LeverUp, Motion, ToolPath, tool_poses
 from foretrace.errors import PerceptionError
 from foretrace.files import versions_of
 from foretrace.geometry import (
@@ -18,7 +18,6 @@ from foretrace.geometry import (
     planar_transform,
     transform_points,
 )
-from foretrace.interactions.outcomes import judge_motion
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Effect, Interaction, Provenance
 from foretrace.interactions.recording_folder import Frame
@@ -360,10 +359,9 @@ def _record(
     trajectory[:, 3:] = continuous_quaternions(trajectory[:, 3:])
     obj = observation.placed.object
     com = transform_points(poses, obj.mass_properties(1.0).com[None])[:, 0]
-    outcome, slip = judge_motion(obj, trajectory, com)
-    x, z, pitch = config.path.at(grid).T
-    tool = np.zeros((len(grid), 7))
-    tool[:, 0], tool[:, 2], tool[:, 3], tool[:, 5] = x, z, np.cos(pitch / 2), np.sin(pitch / 2)
+    action = replace(observation.action, path=config.path)
+    tool = tool_poses(action.tool_motion(grid))
+    judgement = action.judge(Motion(grid, trajectory, tool, np.empty((len(grid), 0))), obj, com)
     effect = Effect(
         times=grid,
         pose_trajectory=trajectory,
@@ -372,15 +370,15 @@ def _record(
         joint_trajectory=np.empty((len(grid), 0)),
         support_points=np.full((2, 2), np.nan),
         support_corners=(),
-        outcome=outcome,
-        slip_index=slip,
+        outcome=judgement.outcome,
+        slip_index=judgement.slip_index,
     )
-    provenance = Provenance(source="recorded", engine="", versions=versions_of("foretrace", "numpy"))
-    return Interaction(
-        obj,
-        observation.action,
-        observation.view,
-        effect,
-        provenance=provenance,
-        stroke=Stroke.of(config.path),
+    provenance = Provenance(
+        source="recorded",
+        engine="",
+        camera="recorded",
+        timestep=0.0,
+        sample_period=config.sample_period,
+        versions=versions_of("foretrace", "numpy"),
     )
+    return Interaction(obj, action, observation.view, effect, provenance=provenance)

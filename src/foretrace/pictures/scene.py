@@ -34,7 +34,7 @@ OBJECT_COLOR = "#dde6f0"
 OBJECT_EDGE = "#4a6078"
 TOOL_COLOR = "#6b5b4b"
 SUPPORT_COLOR = "#a3458f"
-OUTCOME_COLORS = {
+OUTCOME_COLORS: dict[str, str] = {
     Outcome.LEVERED: "#009e73",
     Outcome.SLIPPED: "#e69f00",
     Outcome.TUMBLED: "#d55e00",

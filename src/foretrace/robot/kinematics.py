@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from foretrace.actions import Screwdriver
 from foretrace.geometry import transform_points
 from foretrace.interactions.record import Physics
 from foretrace.simulation import arm
 from foretrace.simulation.scene import build_scene
-from foretrace.simulation.tool import Tool
 
 FIXED_BODIES = ("world", "base", "link_shoulder_pan")
 """Bodies whose height above the base does not change."""
@@ -46,7 +46,7 @@ class ArmKinematics:
         tool: Dimensions of the screwdriver.
     """
 
-    def __init__(self, tool: Tool) -> None:
+    def __init__(self, tool: Screwdriver) -> None:
         self._model = build_scene(None, Physics(), tool, "arm", 0.002).compile()
         self._data = mujoco.MjData(self._model)
         model, capsule = self._model, mujoco.mjtGeom.mjGEOM_CAPSULE

@@ -1,20 +1,19 @@
 """The arm's joint path for one lever-up on a real table, in legs that each start and end at rest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, ToolPath, tool_transforms
 from foretrace.errors import RobotError
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, pose_to_matrix
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.simulation import arm
-from foretrace.simulation.engine import tip_transforms
 
 KNOT_PERIOD = 0.04
 """Inverse kinematics is solved at these intervals of the unscaled path; a cubic spline joins the solutions [s]."""
@@ -87,7 +86,7 @@ def plan_lever_up(
     if not 0 < speed <= 1:
         raise RobotError(f"speed {speed}: choose more than 0 and at most 1, the tool path's own speed")
     T_base_action = invert_transform(T_table_base) @ invert_transform(action.T_action_object)
-    lever = tip_transforms(tool_path, _knots(tool_path.duration))
+    lever = tool_transforms(replace(action, path=tool_path).tool_motion(_knots(tool_path.duration)))
     descent = np.repeat(lever[:1], len(_knots(DESCENT_TIME)), axis=0)
     remaining = 1 - _minimum_jerk(len(descent))
     descent[:, [0, 2], 3] += remaining[:, None] * np.array(ABOVE)

@@ -1,4 +1,4 @@
-"""The UR10 with its screwdriver, written from the arm's published kinematics; inverse kinematics along a path.
+"""The UR10 with a tool, written from the arm's published kinematics; inverse kinematics along a path.
 
 Denavit-Hartenberg parameters, masses, centres of mass, joint, speed and torque limits are those that Universal
 Robots publishes for the UR10 (CB3). The links are drawn and collide as capsules.
@@ -13,9 +13,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from foretrace.actions import Tool
 from foretrace.errors import ActionError
 from foretrace.geometry import matrix_to_pose
-from foretrace.simulation.tool import TOOL_COLLISION, Tool, add_blade, add_servo
+from foretrace.simulation.tool import TOOL_COLLISION, add_servo, add_tool
 
 NUM_JOINTS = 6
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -78,14 +79,14 @@ HOME = (2.9, -1.2, 2.3, -3.0, -1.5, 1.3)
 
 
 def add_arm(spec: mujoco.MjSpec, tool: Tool, tool_friction: float) -> None:
-    """Adds the arm, its servos and the screwdriver to a scene.
+    """Adds the arm, its servos and a tool to a scene.
 
     Bodies are gravity compensated, as a UR's controller does for its own links and the payload it was told of.
 
     Args:
         spec: The scene, in the action frame.
-        tool: Dimensions of the screwdriver.
-        tool_friction: Friction coefficient of the blade.
+        tool: The tool.
+        tool_friction: Friction coefficient of the tool.
     """
     parent = spec.worldbody.add_body(name="base", pos=BASE_POSITION)
     parent.add_geom(
@@ -138,12 +139,12 @@ def add_arm(spec: mujoco.MjSpec, tool: Tool, tool_friction: float) -> None:
     )
     T = T_flange_tip(tool)
     pose = matrix_to_pose(T)
-    add_blade(holder, tool, tool_friction, pos=pose[:3], quat=pose[3:])
+    add_tool(holder, tool, tool_friction, pos=pose[:3], quat=pose[3:])
 
 
 def T_flange_tip(tool: Tool) -> Float[np.ndarray, "4 4"]:
-    """Blade tip frame in the flange frame: x along the blade, y to the left, z out of its upper face."""
-    # At the flange y is the action's left; the blade's axis is the flange's axis turned up by HOLDER_ANGLE.
+    """Tool frame in the flange frame: x along the tool, y to the left."""
+    # At the flange y is the action's left; the tool's axis is the flange's axis turned up by HOLDER_ANGLE.
     c, s = np.cos(HOLDER_ANGLE), np.sin(HOLDER_ANGLE)
     T = np.eye(4)
     T[:3, 0] = [-s, 0, c]

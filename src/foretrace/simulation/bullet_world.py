@@ -1,4 +1,4 @@
-"""Bodies in Bullet, the paper's physics engine: table, objects and screwdriver.
+"""Bodies in Bullet, the paper's physics engine: table, objects and tools.
 
 Bullet puts a body's frame at its centre of mass, along its principal axes, and multiplies the friction coefficients
 of two surfaces. Objects therefore have friction 1, and table and blade the coefficient of their pair.
@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from foretrace.actions import Tool
 from foretrace.errors import SimulationError
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.objects import CollisionShape, CylinderShape, HullShape
 from foretrace.objects.body import Body
 from foretrace.simulation.scene import TABLE_HEIGHT, TABLE_SIZE, TABLE_THICKNESS
-from foretrace.simulation.tool import Tool
 
 COLLISION_MARGIN = 2e-5
 """Bullet rounds shapes by this radius, so an object rests so far above the table [m]."""
@@ -30,7 +30,7 @@ CONTACT_BREAKING = 0.001
 BOUNCE_SPEED = 0.01
 """Slower impacts do not bounce [m/s]."""
 TOOL_MASS = 1e6
-"""So heavy that no object disturbs the blade's path [kg, kg m^2]."""
+"""So heavy that no object disturbs the tool's path [kg, kg m^2]."""
 CONVEX_TOLERANCE = 1e-6
 """Pieces whose hull has no more than their volume, to this share, are one convex body."""
 
@@ -153,32 +153,35 @@ class World:
         return number
 
     def add_tool(self, tool: Tool, friction: float, not_against: tuple[int, ...]) -> int:
-        """Blade, shaft and handle as one heavy body whose frame is the blade's tip.
+        """A tool as one heavy body with the tool's frame.
 
         Args:
-            tool: Dimensions.
+            tool: The tool.
             friction: Friction coefficient between it and objects.
             not_against: Bodies that it passes through.
 
         Returns:
             Its number.
         """
-        b = self.bullet
-        start, end = -tool.blade_length - tool.shaft_radius, -tool.length
-        middle = -tool.blade_length - 0.5 * (tool.length - tool.blade_length)
-        half = [tool.blade_length / 2, tool.blade_width / 2, tool.blade_thickness / 2]
-        along = [0, float(np.sqrt(0.5)), 0, float(np.sqrt(0.5))]
+        b, parts = self.bullet, tool.parts()
+        boxes = [part.shape == "box" for part in parts]
+        ends = [np.array([part.start, part.end]) for part in parts]
         shape = b.createCollisionShapeArray(
-            shapeTypes=[b.GEOM_BOX, b.GEOM_CAPSULE, b.GEOM_CAPSULE],
-            halfExtents=[half, [0, 0, 0], [0, 0, 0]],
-            radii=[0, tool.shaft_radius, 0.012],
-            lengths=[0, start - middle, middle - end],
-            collisionFramePositions=[
-                [-half[0], 0, half[2]],
-                [(start + middle) / 2, 0, tool.shaft_radius],
-                [(middle + end) / 2, 0, tool.shaft_radius],
+            shapeTypes=[b.GEOM_BOX if box else b.GEOM_CAPSULE for box in boxes],
+            halfExtents=[part.end if box else [0, 0, 0] for part, box in zip(parts, boxes, strict=True)],
+            radii=[part.radius for part in parts],
+            lengths=[
+                0 if box else float(np.linalg.norm(end[0] - end[1]))
+                for end, box in zip(ends, boxes, strict=True)
             ],
-            collisionFrameOrientations=[[0, 0, 0, 1], along, along],
+            collisionFramePositions=[
+                part.start if box else (end.sum(axis=0) / 2).tolist()
+                for part, end, box in zip(parts, ends, boxes, strict=True)
+            ],
+            collisionFrameOrientations=[
+                [0, 0, 0, 1] if box else _turn_from_z(end[0] - end[1])
+                for end, box in zip(ends, boxes, strict=True)
+            ],
         )
         number = b.createMultiBody(TOOL_MASS, shape)
         self._surface(number, friction)
@@ -249,6 +252,15 @@ class World:
         file = folder / "pieces.obj"
         file.write_text(_wavefront(hulls), encoding="ascii")
         return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
+
+
+def _turn_from_z(direction: Float[np.ndarray, " 3"]) -> list[float]:
+    """Quaternion (x, y, z, w) that turns the z axis into a direction."""
+    x, y, z = direction / np.linalg.norm(direction)
+    across = float(np.hypot(x, y))
+    axis = [-y / across, x / across] if across else [1.0, 0.0]
+    half_sine = float(np.sqrt((1 - z) / 2))
+    return [half_sine * axis[0], half_sine * axis[1], 0.0, float(np.sqrt((1 + z) / 2))]
 
 
 def _convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:

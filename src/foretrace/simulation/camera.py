@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from mujoco.rendering.classic import gl_context
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action, Screwdriver
 from foretrace.errors import SimulationError
 from foretrace.geometry import matrix_to_pose, planar_transform
 from foretrace.interactions.pinhole import PinholeCamera
@@ -22,7 +22,6 @@ from foretrace.interactions.record import Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.simulation.scene import body_origin, build_scene
-from foretrace.simulation.tool import Tool
 
 MINIMAL_HEIGHT = 0.008
 """Points lower than this are the table's, noise included [m]."""
@@ -60,7 +59,7 @@ class RgbdConfig:
 
 
 def take_rgbd(
-    obj: ObjectModel, action: LeverUp, config: RgbdConfig = RgbdConfig(), *, seed: int = 0
+    obj: ObjectModel, action: Action, config: RgbdConfig = RgbdConfig(), *, seed: int = 0
 ) -> RgbdFrame:
     """Renders the object on the table before the arm comes into the image.
 
@@ -74,7 +73,7 @@ def take_rgbd(
         SimulationError: If the machine can render neither with EGL nor with OSMesa.
     """
     camera = config.camera
-    spec = build_scene(obj, Physics(), Tool(), None, timestep=0.002)
+    spec = build_scene(obj, Physics(), Screwdriver(), None, timestep=0.002)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
     # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the image.
     spec.worldbody.add_camera(name="above", pos=config.position, quat=[np.sqrt(0.5), 0, 0, -np.sqrt(0.5)])

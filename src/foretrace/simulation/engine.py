@@ -1,64 +1,158 @@
-"""The contract of a physics engine: play one lever-up, report what was seen."""
+"""The contract of a physics engine, and every engine by its name."""
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from foretrace.actions import LeverUp, ToolPath
-from foretrace.geometry import pose_to_matrix
+from foretrace.actions import Motion, Tool
+from foretrace.errors import SimulationError
+from foretrace.interactions.motions import ContactParameters
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
-from foretrace.simulation.tool import Tool
+from foretrace.objects.body import Body
+from foretrace.registry import Registry
 
-ENGINES = ("mujoco", "bullet")
-"""Every engine by its name."""
 SPEED_LIMIT = 60.0
-"""An object faster than this [m/s or rad/s] has been thrown by a numerical blow-up, not by a slow blade."""
+"""An object faster than this [m/s or rad/s] has been thrown by a numerical blow-up, not by a slow tool."""
 STANDING_DEPTH = 2e-4
 """A contact of object and table counts while they are closer than this [m]."""
+COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Coordinates of a tool's frame: position and rotation vector in the action frame."""
+
+ToolMotion = Callable[[Float[np.ndarray, " time"]], Float[np.ndarray, "time 6"]]
+"""Position [m] and rotation vector [rad] of a tool at given times [s], as `Action.tool_motion`."""
+FreePlay = tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]
+"""Poses of the object frame, and velocities of the centre of mass and about it, table frame."""
 
 
-@dataclass(frozen=True)
-class Motion:
-    """What an engine saw of one lever-up, in the action frame."""
+class Engine(ABC):
+    """Plays what a tool does to an object; it knows no action.
 
-    times: Float[np.ndarray, " time"]
-    """Sample times [s]."""
-    object_pose: Float[np.ndarray, "time 7"]
-    """Object frame: position [m], quaternion (w, x, y, z)."""
-    tool_pose: Float[np.ndarray, "time 7"]
-    """Blade tip frame: position [m], quaternion (w, x, y, z)."""
-    joints: Float[np.ndarray, "time joints"]
-    """Joint angles of the arm [rad]; no columns for the tool alone."""
-    on_blade: Bool[np.ndarray, " time"]
-    """Whether blade or shaft touched the object."""
-    table_contacts: tuple[Float[np.ndarray, "_ 3"], ...]
-    """Per sample, the points where the object stood on the table, in the object frame [m]."""
-    path_error: float
-    """Largest distance of the blade tip from its planned path [m]."""
-    diverged: bool
-    """Whether the numbers blew up."""
+    Implementations are deterministic: equal arguments give equal motions. They are made with an embodiment, a time
+    step [s] and a sample period [s], and refuse what they cannot play. A subclass registers itself by its name.
+    """
 
-
-@runtime_checkable
-class Engine(Protocol):
-    """Plays lever-ups. Implementations are deterministic: equal arguments give equal motions."""
-
-    name: str
-    library: str
+    name: ClassVar[str]
+    """Name in records and commands."""
+    library: ClassVar[str]
     """Distribution whose version shapes the numbers."""
 
-    def play(self, obj: ObjectModel, action: LeverUp, path: ToolPath, tool: Tool, physics: Physics) -> Motion:
-        """Plays one lever-up from the moment before the blade moves until the end of the path."""
-        ...
+    @abstractmethod
+    def __init__(self, embodiment: str, timestep: float, sample_period: float) -> None: ...
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if cls.name not in BUILT_IN:
+            ENGINES.add(cls.name, cls)
+
+    @abstractmethod
+    def play(
+        self,
+        obj: ObjectModel,
+        T_action_object: Float[np.ndarray, "4 4"],
+        tool: Tool,
+        tool_motion: ToolMotion,
+        duration: float,
+        physics: Physics,
+    ) -> Motion:
+        """Plays an action, from the moment before the tool moves.
+
+        Args:
+            obj: The object.
+            T_action_object: Pose of the object frame at rest in the action frame.
+            tool: The tool.
+            tool_motion: Pose of the tool over time.
+            duration: Time to play [s].
+            physics: Friction and density.
+
+        Raises:
+            SimulationError: The tool's motion is not finite, or turns about more than one axis.
+            ActionError: The arm cannot follow the tool's motion.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def play_freely(
+        body: Body,
+        pose: Float[np.ndarray, " 7"],
+        velocity: Float[np.ndarray, " 6"],
+        contact_parameters: ContactParameters,
+        steps: int,
+        timestep: float,
+    ) -> FreePlay:
+        """Plays the motion of a free body, as `simulate_free_motion` describes it."""
 
 
-def tip_transforms(path: ToolPath, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4 4"]:
-    """Planned blade tip in the action frame: x along the blade, y to the left, z out of its upper face."""
-    x, z, pitch = path.at(times).T
-    pose = np.zeros((len(times), 7))
-    pose[:, 0], pose[:, 2] = x, z
-    pose[:, 3], pose[:, 5] = np.cos(pitch / 2), np.sin(pitch / 2)
-    return pose_to_matrix(pose)
+def _mujoco() -> type[Engine]:
+    from foretrace.simulation.mujoco_engine import MujocoEngine
+
+    return MujocoEngine
+
+
+def _bullet() -> type[Engine]:
+    from foretrace.simulation.bullet_engine import BulletEngine
+
+    return BulletEngine
+
+
+BUILT_IN: dict[str, Callable[[], type[Engine]]] = {"mujoco": _mujoco, "bullet": _bullet}
+"""Engines that are imported on first use."""
+ENGINES: Registry[Callable[..., Any]] = Registry("engine", "foretrace.engines", SimulationError)
+"""Every engine by its name: a class, or for a built-in one a function that imports it."""
+for _name, _load in BUILT_IN.items():
+    ENGINES.add(_name, _load)
+
+
+def engine_class(name: str) -> type[Engine]:
+    """The engine of a name.
+
+    Raises:
+        SimulationError: There is no such engine.
+    """
+    found = ENGINES.find(name)
+    return found if isinstance(found, type) else found()
+
+
+@lru_cache(maxsize=4)
+def make_engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
+    """An engine, ready to play.
+
+    Args:
+        name: One of ENGINES.
+        embodiment: ``arm`` or ``tool``.
+        timestep: Time step [s].
+        sample_period: Time between recorded samples [s].
+
+    Raises:
+        SimulationError: If there is no such engine, or it cannot play that.
+    """
+    return engine_class(name)(embodiment, timestep, sample_period)
+
+
+def sample_tool(tool_motion: ToolMotion, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 6"]:
+    """A tool's motion at given times [s], checked.
+
+    Raises:
+        SimulationError: It has another shape, is not finite, or turns about more than one axis of the action frame.
+    """
+    coordinates = np.asarray(tool_motion(times), dtype=float)
+    if coordinates.shape != (len(times), 6) or not np.isfinite(coordinates).all():
+        raise SimulationError(
+            f"the tool's motion has the shape {coordinates.shape}, or is not finite: "
+            f"give {len(times)} rows of position [m] and rotation vector [rad]"
+        )
+    axes = [COORDINATES[k] for k in used_coordinates(coordinates) if k >= 3]
+    if len(axes) > 1:
+        raise SimulationError(
+            f"the tool turns about more than one axis ({', '.join(axes)}): keep two of them at 0"
+        )
+    return coordinates
+
+
+def used_coordinates(coordinates: Float[np.ndarray, "time 6"]) -> tuple[int, ...]:
+    """Numbers of the coordinates that a tool's motion uses: those that are not always 0."""
+    return tuple(int(k) for k in np.flatnonzero((coordinates != 0).any(axis=0)))

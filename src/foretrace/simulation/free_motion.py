@@ -4,7 +4,6 @@ What both engines are checked with against mechanics in closed form, and what re
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +12,7 @@ from foretrace.errors import SimulationError
 from foretrace.geometry import Numbers, continuous_quaternions
 from foretrace.interactions.motions import ContactParameters
 from foretrace.objects.body import Body
-from foretrace.simulation.engine import ENGINES
+from foretrace.simulation.engine import engine_class
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,18 +74,10 @@ def simulate_free_motion(
             f"timestep = {timestep} s, duration = {duration} s: choose at most 0.02 s and an hour"
         )
     steps = int(np.ceil(duration / timestep - 1e-9))
-    poses, velocities = _player(engine)(body, pose, speed, contact_parameters, steps, timestep)
+    poses, velocities = engine_class(engine).play_freely(
+        body, pose, speed, contact_parameters, steps, timestep
+    )
     if not np.isfinite(poses).all():
         raise SimulationError("the numbers blew up: take a smaller time step")
     poses[:, 3:] = continuous_quaternions(poses[:, 3:])
     return FreeMotion(np.arange(steps + 1) * timestep, poses, velocities)
-
-
-def _player(engine: str) -> Any:
-    if engine == "mujoco":
-        from foretrace.simulation.mujoco_free_motion import play_freely
-    elif engine == "bullet":
-        from foretrace.simulation.bullet_engine import play_freely
-    else:
-        raise SimulationError(f"engine {engine!r} is unknown: choose one of {', '.join(ENGINES)}")
-    return play_freely

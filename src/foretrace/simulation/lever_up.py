@@ -1,15 +1,14 @@
-"""Play the action, judge and record the effect (paper, section 4)."""
+"""Simulate an action, and record its effect (paper, section 4)."""
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from foretrace.actions import LeverUp, Stroke, ToolPath
-from foretrace.errors import SimulationError
+from foretrace.actions import FAILED, Action, Motion, ToolPath
+from foretrace.errors import ActionError, SimulationError
+from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
     invert_transform,
@@ -18,78 +17,41 @@ from foretrace.geometry import (
     quaternion_to_matrix,
     transform_points,
 )
-from foretrace.interactions.outcomes import lifted_samples, name_outcome
 from foretrace.interactions.record import (
-    AS_TOLD,
+    NO_OFFSET,
     Effect,
+    ExecutionOffset,
     Interaction,
-    Misplacement,
-    Outcome,
     Physics,
     Provenance,
 )
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
-from foretrace.simulation.engine import ENGINES, Engine, Motion
-from foretrace.simulation.tool import Tool
+from foretrace.simulation.engine import make_engine
 
 CAMERAS = ("exact", "rgbd")
 PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
 """What is simulated: friction coefficients, densities of anything solid [kg/m^3]."""
-OFF_SAMPLES = 2
-"""So many samples in a row off the blade are a slip; one alone is a bounce."""
 FALL_DEPTH = 0.5
 """The record of a falling object ends this far below the table top, above the floor [m]."""
-CORNER_REACH = 0.004
-"""A table contact belongs to a corner within this distance [m]."""
-SUPPORT_SHARE = 0.5
-"""A support corner carries the object in at least this share of the lifted samples."""
-
-
-@lru_cache(maxsize=4)
-def make_engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
-    """The engine of a name.
-
-    Args:
-        name: One of ENGINES.
-        embodiment: ``arm`` or ``tool``.
-        timestep: Time step [s].
-        sample_period: Time between recorded samples [s].
-
-    Raises:
-        SimulationError: If there is no such engine.
-    """
-    if name == "mujoco":
-        from foretrace.simulation.mujoco_engine import MujocoEngine
-
-        return MujocoEngine(embodiment, timestep, sample_period)
-    if name == "bullet":
-        from foretrace.simulation.bullet_engine import BulletEngine
-
-        return BulletEngine(embodiment, timestep, sample_period)
-    raise SimulationError(f"engine {name!r} is unknown: choose one of {', '.join(ENGINES)}")
 
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """How lever-ups are simulated."""
+    """How actions are simulated."""
 
     engine: str = "mujoco"
     """Physics engine."""
     embodiment: str = "arm"
-    """``arm``: the whole robot; ``tool``: the blade alone on the same path."""
+    """``arm``: the whole robot; ``tool``: the tool alone on the same path."""
     camera: str = "exact"
     """``exact``: the view from geometry; ``rgbd``: from a rendered depth image."""
     timestep: float = 0.002
     """Time step [s]."""
     sample_period: float = 0.05
     """Time between recorded samples [s]."""
-    path: ToolPath = field(default_factory=ToolPath)
-    """The blade's path."""
     watch_time: float = 0.0
-    """How long the object is watched on after the path's end, while the blade stands still [s]."""
-    tool: Tool = field(default_factory=Tool)
-    """The screwdriver."""
+    """Time for which the object is observed after the end of the tool's path, while the tool stands still [s]."""
     physics: Physics = field(default_factory=Physics)
     """Friction and density."""
 
@@ -115,32 +77,34 @@ class SimulationConfig:
 
 def simulate_lever_up(
     obj: ObjectModel,
-    action: LeverUp,
+    action: Action,
     config: SimulationConfig = SimulationConfig(),
     *,
     seed: int = 0,
     id: int = 0,
-    misplacement: Misplacement = AS_TOLD,
+    execution_error: ExecutionOffset = NO_OFFSET,
 ) -> Interaction:
-    """Simulates one lever-up and records it.
+    """Simulates an action, a lever-up or any other one, and records it.
 
     Args:
         obj: The object.
-        action: Where and which way it is levered up.
-        config: How.
+        action: The action as commanded.
+        config: How it is simulated.
         seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
         id: Number of the interaction within its data set.
-        misplacement: How far from what it is told the blade acts. View and effect stay in the told frame; joint
-            angles are those that were played.
+        execution_error: Offset of the executed action from the commanded one. View and effect stay in the commanded
+            action's frame; joint angles are those of the executed action.
 
     Returns:
         The interaction; its outcome is ``failed`` and its trajectories are empty if the simulation diverged.
 
     Raises:
-        SimulationError: If the machine cannot render the view.
+        SimulationError: If the machine cannot render the view, or the tool's motion cannot be simulated.
         ActionError: If the contact is not on the outline, or the arm cannot follow the path.
         ViewError: If the object does not fit in the view.
     """
+    if not isinstance(action, Action):
+        raise ActionError(f"{action!r} is no action: give a LeverUp or another Action")
     action.check_contact(obj)
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
@@ -150,129 +114,136 @@ def simulate_lever_up(
         from foretrace.simulation.camera import take_rgbd
 
         view = take_rgbd(obj, action, seed=seed).view()
-    path = replace(config.path, hold_time=config.path.hold_time + config.watch_time)
-    done = action if misplacement == AS_TOLD else action.moved(**asdict(misplacement))
-    motion = engine.play(obj, done, path, config.tool, config.physics)
-    effect = judge(motion, obj, done, config.physics)
-    if done is not action:
-        effect = _transformed(effect, action.T_action_object @ invert_transform(done.T_action_object))
-    return Interaction(
-        object=obj,
-        action=action,
-        view=view,
-        effect=effect,
-        physics=config.physics,
-        provenance=Provenance(
-            source="simulated",
-            engine=engine.name,
-            embodiment=config.embodiment,
-            seed=seed,
-            versions=_versions(engine.library),
-        ),
-        misplacement=misplacement,
-        stroke=Stroke.of(config.path),
-        id=id,
-    )
+    executed = action if execution_error == NO_OFFSET else action.moved(**asdict(execution_error))
+    duration = executed.duration + config.watch_time
+    pose = executed.T_action_object
+    motion = engine.play(obj, pose, executed.tool, executed.tool_motion, duration, config.physics)
+    effect = effect_of(motion, obj, executed, config.physics)
+    if executed is not action:
+        effect = _transformed(effect, action.T_action_object @ invert_transform(pose))
+    made = {name: getattr(config, name) for name in SETTINGS}
+    provenance = Provenance(seed=seed, versions=versions_of("foretrace", "numpy", engine.library), **made)
+    return Interaction(obj, action, view, effect, config.physics, provenance, execution_error, id)
+
+
+SETTINGS = ("engine", "embodiment", "camera", "timestep", "sample_period", "watch_time")
+"""Settings of a `SimulationConfig` that a `Provenance` keeps by the same names."""
 
 
 def simulate(
     obj: ObjectModel,
-    action: LeverUp,
+    action: Action,
     *,
     engine: str = "mujoco",
     embodiment: str = "arm",
     camera: str = "exact",
     seed: int = 0,
     physics: Physics | None = None,
-    path: ToolPath | None = None,
+    timestep: float = SimulationConfig.timestep,
+    sample_period: float = SimulationConfig.sample_period,
     watch_time: float = 0.0,
+    path: ToolPath | None = None,
 ) -> Interaction:
-    """Simulates one lever-up; ``simulate_lever_up`` with the settings that people change spelled out.
+    """Simulates one action.
 
     Args:
         obj: The object.
-        action: Where and which way it is levered up, in the object frame.
+        action: A `LeverUp` or another action.
         engine: Physics engine.
-        embodiment: ``arm``: the whole robot; ``tool``: the blade alone on the same path.
+        embodiment: ``arm``: the whole robot; ``tool``: the tool alone on the same path.
         camera: ``exact``: the view from geometry; ``rgbd``: from a rendered depth image.
         seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
-        physics: Friction and density, if not the usual ones.
-        path: The blade's path, if not the usual one.
-        watch_time: How long the object is watched on after the path's end [s].
+        physics: Friction and density, if not the nominal ones.
+        timestep: Time step [s].
+        sample_period: Time between recorded samples [s].
+        watch_time: Time for which the object is observed after the end of the tool's path [s].
+        path: Path of the tool in place of the action's own.
 
     Raises:
-        SimulationError: If engine, embodiment or camera is unknown.
+        SimulationError: If engine, embodiment or camera is unknown, or a setting is out of range.
         ActionError: If the contact is not on the outline, or the arm cannot follow the path.
         ViewError: If the object does not fit in the view.
     """
     config = SimulationConfig(
-        engine=engine,
-        embodiment=embodiment,
-        camera=camera,
-        path=path or ToolPath(),
-        physics=physics or Physics(),
-        watch_time=watch_time,
+        engine, embodiment, camera, timestep, sample_period, watch_time, physics or Physics()
     )
+    action = action if path is None else replace(action, path=path)
     return simulate_lever_up(obj, action, config, seed=seed)
 
 
-def judge(motion: Motion, obj: ObjectModel, action: LeverUp, physics: Physics) -> Effect:
-    """Turns what the engine saw into the record of an effect: outcome, slip and support points.
+def replay(interaction: Interaction) -> Interaction:
+    """Simulates a recorded interaction again, with everything that it records.
+
+    On the same kind of machine with the same versions of the libraries, the result equals the record byte for byte.
+
+    Raises:
+        SimulationError: The interaction is a recording of a real one, or its engine is not installed.
+    """
+    made = interaction.provenance
+    if made.source != "simulated":
+        raise SimulationError(
+            f"interaction {interaction.id} is {made.source}, not simulated: only simulated interactions can be replayed"
+        )
+    config = SimulationConfig(physics=interaction.physics, **{name: getattr(made, name) for name in SETTINGS})
+    return simulate_lever_up(
+        interaction.object,
+        interaction.action,
+        config,
+        seed=made.seed,
+        id=interaction.id,
+        execution_error=interaction.execution_error,
+    )
+
+
+def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics) -> Effect:
+    """The record of an effect: what was seen, and what the action's judge concludes.
 
     Args:
-        motion: The engine's motion.
+        motion: The motion in the frame of the executed action.
         obj: The object.
-        action: The lever-up.
+        action: The executed action.
         physics: Friction and density.
     """
     unknown = np.full((2, 2), np.nan)
     if motion.diverged:
         empty = np.empty((0, 7))
         joints = np.empty((0, motion.joints.shape[1]))
-        return Effect(np.empty(0), empty, np.empty((0, 3)), empty, joints, unknown, (), Outcome.FAILED)
+        return Effect(np.empty(0), empty, np.empty((0, 3)), empty, joints, unknown, (), FAILED)
     motion, fall = _until_the_floor(motion, obj, physics)
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
     com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
-    lifted = lifted_samples(obj, rotation, com[:, 2])
-    slip = _slip_index(lifted, motion.on_blade)
-    outcome = name_outcome(rotation, com[:, 2], lifted, bool(motion.on_blade[-1]), slip)
-    corners, points = (), unknown
-    end = len(com) if slip is None else slip
-    if lifted[:end].any() and outcome != Outcome.ROLLED:
-        counts = _corner_counts(motion, obj, np.flatnonzero(lifted[:end]))
-        shares = counts / max(int(lifted[:end].sum()), 1)
-        corners = tuple(int(k) for k in np.flatnonzero(shares >= SUPPORT_SHARE))
-        busiest = np.argsort(-counts, kind="stable")[:2]
-        if (counts[busiest] > 0).all():
-            at_rest = np.column_stack([obj.support_corners[np.sort(busiest)], np.zeros(2)])
-            points = transform_points(action.T_action_object, at_rest)[:, :2]
+    judgement = action.judge(motion, obj, com)
+    if judgement.outcome not in action.outcomes:
+        raise SimulationError(
+            f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
+            f"{', '.join(action.outcomes)}"
+        )
     return Effect(
         times=motion.times,
         pose_trajectory=motion.object_pose,
         com_trajectory=com,
         tool_trajectory=motion.tool_pose,
         joint_trajectory=motion.joints,
-        support_points=points,
-        support_corners=corners,
-        outcome=outcome,
-        slip_index=None if outcome in (Outcome.ROLLED, Outcome.TUMBLED) else slip,
+        support_points=unknown if judgement.support_points is None else judgement.support_points,
+        support_corners=judgement.support_corners,
+        outcome=judgement.outcome,
+        slip_index=judgement.slip_index,
         fall_index=fall,
         path_error=motion.path_error,
     )
 
 
-def _transformed(effect: Effect, T_told_done: Float[np.ndarray, "4 4"]) -> Effect:
-    """An effect in the frame that was told, from the frame in which the blade really acted."""
-    told: dict[str, Any] = {
-        "com_trajectory": transform_points(T_told_done, effect.com_trajectory),
-        "support_points": transform_points(
-            T_told_done, np.column_stack([effect.support_points, np.zeros(2)])
-        )[:, :2],
+def _transformed(effect: Effect, T_commanded_executed: Float[np.ndarray, "4 4"]) -> Effect:
+    """An effect in the commanded action's frame, from the executed action's."""
+    at_rest = np.column_stack([effect.support_points, np.zeros(2)])
+    moved: dict[str, Any] = {
+        "com_trajectory": transform_points(T_commanded_executed, effect.com_trajectory),
+        "support_points": transform_points(T_commanded_executed, at_rest)[:, :2],
     }
     for name in ("pose_trajectory", "tool_trajectory"):
-        pose = matrix_to_pose(T_told_done @ pose_to_matrix(getattr(effect, name)))
-        told[name] = np.concatenate([pose[:, :3], continuous_quaternions(pose[:, 3:])], axis=1)
-    return replace(effect, **told)
+        pose = matrix_to_pose(T_commanded_executed @ pose_to_matrix(getattr(effect, name)))
+        moved[name] = np.concatenate([pose[:, :3], continuous_quaternions(pose[:, 3:])], axis=1)
+    return replace(effect, **moved)
 
 
 def _until_the_floor(motion: Motion, obj: ObjectModel, physics: Physics) -> tuple[Motion, int | None]:
@@ -282,42 +253,6 @@ def _until_the_floor(motion: Motion, obj: ObjectModel, physics: Physics) -> tupl
     if physics.table_edge is None or (height > 0).all():
         return motion, None
     end = int((height < -FALL_DEPTH).argmax()) or len(height)
-    cut = {
-        name: getattr(motion, name)[:end]
-        for name in ("times", "object_pose", "tool_pose", "joints", "on_blade", "table_contacts")
-    }
+    names = ("times", "object_pose", "tool_pose", "joints", "on_tool", "table_contacts")
+    cut = {name: values[:end] for name in names if (values := getattr(motion, name)) is not None}
     return replace(motion, **cut), int((height <= 0).argmax())
-
-
-def _slip_index(lifted: Bool[np.ndarray, " time"], on_blade: Bool[np.ndarray, " time"]) -> int | None:
-    """First sample of the first lasting loss of contact after the object was first lifted."""
-    if not lifted.any():
-        return None
-    off = ~on_blade
-    off[: int(lifted.argmax())] = False
-    lasting = off.copy()
-    for k in range(1, OFF_SAMPLES):
-        # At the record's end the missing samples count as off.
-        lasting &= np.append(off[k:], np.ones(k, dtype=bool))
-    return int(lasting.argmax()) if lasting.any() else None
-
-
-def _corner_counts(
-    motion: Motion, obj: ObjectModel, samples: Int[np.ndarray, " samples"]
-) -> Int[np.ndarray, " corners"]:
-    """In how many of the given samples each corner of the object stood on the table."""
-    counts = np.zeros(len(obj.corners), dtype=int)
-    # With growing tilt the object passes from the bevel's inner to its outer edge: a corner is the segment between.
-    start, along = obj.support_corners, obj.corners - obj.support_corners
-    length2 = np.maximum((along**2).sum(axis=1), 1e-18)
-    for i in samples:
-        points = motion.table_contacts[i][:, None, :2] - start  # (contacts, corners, 2)
-        t = np.clip((points * along).sum(axis=-1) / length2, 0.0, 1.0)
-        distance = np.linalg.norm(points - t[..., None] * along, axis=-1)
-        counts += (distance < CORNER_REACH).any(axis=0)
-    return counts
-
-
-@lru_cache(maxsize=4)
-def _versions(library: str) -> dict[str, str]:
-    return {name: version(name) for name in ("foretrace", "numpy", library)}

@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
+from foretrace.actions import Screwdriver
 from foretrace.geometry import matrix_to_pose, quaternion_to_matrix
 from foretrace.interactions.motions import ContactParameters
 from foretrace.interactions.record import Physics
 from foretrace.objects import HullShape
 from foretrace.objects.body import Body
 from foretrace.simulation.scene import build_scene
-from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, Tool
+from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
@@ -49,7 +50,7 @@ def play_freely(
 
 def _compile(body: Body, contact_parameters: ContactParameters, timestep: float) -> mujoco.MjModel:
     friction = [contact_parameters.friction, 0.005, contact_parameters.rolling_friction]
-    spec = build_scene(None, Physics(friction=contact_parameters.friction), Tool(), None, timestep)
+    spec = build_scene(None, Physics(friction=contact_parameters.friction), Screwdriver(), None, timestep)
     spec.option.gravity = contact_parameters.gravity
     table = spec.geom("table")
     table.friction = friction

@@ -1,7 +1,7 @@
-"""Lever-ups that differ from what is told of them: domain randomisation (paper, section 6).
+"""Lever-ups that differ from their nominal ones: domain randomisation (paper, section 6).
 
-What is drawn for a lever-up depends on the data set's seed and on the lever-up alone, never on who simulates it, and
-what is drawn for one quantity does not depend on which others vary.
+The draws of a lever-up depend on the data set's seed and its own number alone, and those of one quantity do not depend
+on which others vary.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -10,17 +10,17 @@ import numpy as np
 
 from foretrace.actions import CONTACT_TOLERANCE, ToolPath
 from foretrace.errors import SimulationError
-from foretrace.interactions.record import Misplacement, Physics
+from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.objects import Bevel, Box, ObjectModel, Prism
 
 Range = tuple[float, float]
 """Least and greatest value of what is drawn uniformly."""
 LARGEST = {
-    "misplaced_ahead": CONTACT_TOLERANCE,
-    "misplaced_left": CONTACT_TOLERANCE,
-    "misplaced_turn": 0.5,
+    "execution_ahead": CONTACT_TOLERANCE,
+    "execution_left": CONTACT_TOLERANCE,
+    "execution_turn": 0.5,
 }
-"""How far a blade may err at most [m, rad]: beyond, it is another action."""
+"""Largest execution errors [m, rad]: beyond them it is another action."""
 
 
 @dataclass(frozen=True)
@@ -45,20 +45,20 @@ class Randomisation:
     """Times the width of its bevel: how far the bottom face lies inside the outline."""
     bevel_height_factor: Range | None = None
     """Times the height of its bevel: how much room the blade has under the rim."""
-    misplaced_ahead: float = 0.0
-    """The blade meets the object up to this far ahead of where it was told to, or behind [m]."""
-    misplaced_left: float = 0.0
-    """It meets it up to this far to either side of there [m]."""
-    misplaced_turn: float = 0.0
-    """It points up to this far to either side of where it was told to [rad]."""
+    execution_ahead: float = 0.0
+    """Largest distance of the blade ahead of the commanded contact, or behind [m]."""
+    execution_left: float = 0.0
+    """Largest distance to either side of it [m]."""
+    execution_turn: float = 0.0
+    """Largest angle to either side of the commanded direction [rad]."""
     insertion: Range | None = None
-    """How far the blade is pushed under the object [m]; None leaves the configured path."""
+    """Distances that the blade is pushed under the object [m]; None leaves the configured path."""
     arc_radius: Range | None = None
     """Radii of the arc on which it lifts [m]."""
     sweep: Range | None = None
     """Angles of that arc [rad]."""
     speed: Range | None = None
-    """Times as fast as configured. The blade rests at the end until the slowest would be there, too."""
+    """Multiples of the configured speed. The blade rests at the end until the slowest one would be there, too."""
 
     def __post_init__(self) -> None:
         for name in RANGES:
@@ -78,14 +78,14 @@ class Randomisation:
 
     def vary(
         self, obj: ObjectModel, physics: Physics, path: ToolPath, rng: np.random.Generator
-    ) -> tuple[ObjectModel, Physics, ToolPath, Misplacement]:
-        """One lever-up's object, constants, path and misplacement.
+    ) -> tuple[ObjectModel, Physics, ToolPath, ExecutionOffset]:
+        """One lever-up's object, constants, path and execution error.
 
         Args:
             obj: The object as configured.
             physics: Friction and density as configured.
             path: The blade's path as configured.
-            rng: What is drawn from: always one number for each setting, in their order.
+            rng: Random numbers: always one for each setting, in their order.
 
         Raises:
             ShapeError: A thinner object or a wider bevel leaves no bottom face.
@@ -103,11 +103,16 @@ class Randomisation:
         path = replace(path, **{name: drawn[name] for name in PATH if name in drawn})
         if self.speed is not None:
             path = _sped_up(path, drawn["speed"], slowest=self.speed[0])
-        return reshaped(obj, *factors), replace(physics, **constants), path, Misplacement(ahead, left, turn)
+        return (
+            reshaped(obj, *factors),
+            replace(physics, **constants),
+            path,
+            ExecutionOffset(ahead, left, turn),
+        )
 
 
 def _sped_up(path: ToolPath, speed: float, slowest: float) -> ToolPath:
-    """A path so many times as fast, with a rest that makes it end when the slowest one does."""
+    """A path at a multiple of its speed, with a rest that makes it end when the slowest one does."""
     rest = path.faster(slowest).duration - path.faster(speed).duration
     return replace(path.faster(speed), hold_time=path.hold_time + rest)
 
@@ -120,7 +125,7 @@ PATH = ("insertion", "arc_radius", "sweep")
 """What is drawn of the blade's path, as it stands in `ToolPath`."""
 RANGES = (*CONSTANTS, *FACTORS, *PATH, "speed")
 NOTHING = Randomisation()
-"""Every lever-up as told."""
+"""Every lever-up as commanded, of the nominal object."""
 RANDOMISED = Randomisation(
     friction=(0.5, 1.1),
     tool_friction=(0.2, 0.45),
@@ -128,11 +133,11 @@ RANDOMISED = Randomisation(
     thickness_factor=(0.75, 1.25),
     bevel_width_factor=(0.8, 1.2),
     bevel_height_factor=(0.8, 1.2),
-    misplaced_ahead=0.003,
-    misplaced_left=0.003,
-    misplaced_turn=float(np.deg2rad(3.0)),
+    execution_ahead=0.003,
+    execution_left=0.003,
+    execution_turn=float(np.deg2rad(3.0)),
 )
-"""What ``foretrace simulate --randomise`` draws from: around the usual constants, as wide as a robot's owner might be
+"""What ``foretrace simulate --randomise`` draws from: around the nominal constants, as wide as a robot's owner might be
 wrong about a slab of wood or plastic, a steel blade and a calibrated camera."""
 
 VARIED_ACTION = {
@@ -141,7 +146,7 @@ VARIED_ACTION = {
     "sweep": (0.45, 1.0),
     "speed": (2 / 3, 1.5),
 }
-"""What ``foretrace simulate --vary-action`` draws from: around the usual path, within the arm's reach and speed."""
+"""What ``foretrace simulate --vary-action`` draws from: around the nominal path, within the arm's reach and speed."""
 
 
 def reshaped(obj: ObjectModel, thickness: float, bevel_width: float, bevel_height: float) -> ObjectModel:

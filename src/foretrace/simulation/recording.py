@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
 
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, Motion
 from foretrace.errors import SimulationError
 from foretrace.files import write_json
 from foretrace.geometry import (
@@ -29,9 +29,9 @@ from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.recording_folder import Frame, RecordingNotes, write_recording
 from foretrace.objects import ObjectModel
-from foretrace.simulation.engine import Motion
+from foretrace.simulation.engine import make_engine
 from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_image, spoil, spoil_depth
-from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
+from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.stage import ObjectColour, TableTop, cast_shadows, set_stage
 
@@ -45,6 +45,8 @@ FINE_PERIOD = 0.01
 TABLE_SPOTS = ((0.33, 0.15), (0.33, -0.15), (-0.13, 0.21), (-0.13, -0.21))
 """Where the table's markers lie in the action frame [m]: clear of any object of 10 cm radius."""
 OBJECT_ID = 10
+X_Z_PITCH = (0, 2, 4)
+"""Coordinates in which a lever-up's tool moves."""
 OUT_OF_SIGHT = (0.0, 0.0, -5.0)
 FAULTS = Faults()
 """The nominal ones."""
@@ -171,16 +173,20 @@ def record_lever_up(
     simulation = config.simulation
     interaction = simulate_lever_up(obj, action, simulation, seed=seed)
     engine = make_engine("mujoco", simulation.embodiment, simulation.timestep, FINE_PERIOD)
-    motion = engine.play(obj, action, simulation.path, simulation.tool, simulation.physics)
+    motion = engine.play(
+        obj, action.T_action_object, action.tool, action.tool_motion, action.duration, simulation.physics
+    )
     T_object_marker, side = marker_spot(obj, config.largest_side, rng)
     T_action_camera = camera_pose(config)
-    spec = build_scene(obj, simulation.physics, simulation.tool, simulation.embodiment, simulation.timestep)
+    spec = build_scene(
+        obj, simulation.physics, action.tool, simulation.embodiment, simulation.timestep, X_Z_PITCH
+    )
     T_action_table = _add_markers(spec, obj, T_object_marker, side, config, rng)
     T_table_action = invert_transform(T_action_table)
     set_stage(spec, config.table, config.object_colour, np.random.default_rng([seed, 1]))
     lamp = cast_shadows(spec, np.random.default_rng([seed, 2])) if config.shadows else None
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
-    duration = config.lead_time + simulation.path.duration + config.tail_time
+    duration = config.lead_time + action.duration + config.tail_time
     count = max(1, round(duration * config.frames_per_second))
     times = action_start - config.lead_time + np.arange(count) / config.frames_per_second
     poses = _interpolate(motion, times - action_start)[0]

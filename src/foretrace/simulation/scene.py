@@ -1,21 +1,24 @@
-"""One scene: table, object, screwdriver on the arm or alone; built in code as one MuJoCo specification.
+"""One scene: table, object, tool on the arm or alone; built in code as one MuJoCo specification.
 
-The scene lies in the action frame, so the tool path is the same for every object and it is the object that is
-placed: its contact point at the origin, the action's direction along x (paper, section 3.1).
+The scene lies in the action frame, so the tool's path is the same for every object, and the object is placed: its
+contact point at the origin, the action's direction along x (paper, section 3.1).
 """
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs.
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from foretrace.actions import Tool
 from foretrace.geometry import matrix_to_pose
 from foretrace.interactions.record import Physics
 from foretrace.objects import HullShape, ObjectModel
 from foretrace.simulation.arm import add_arm
-from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, TOOL_BIT, Tool, add_carriage
+from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, TOOL_BIT, add_carriage
 
 EMBODIMENTS = ("arm", "tool")
 CONTACT_TIME = 0.015
@@ -35,16 +38,22 @@ TABLE_HEIGHT = 0.75
 
 
 def build_scene(
-    obj: ObjectModel | None, physics: Physics, tool: Tool, embodiment: str | None, timestep: float
+    obj: ObjectModel | None,
+    physics: Physics,
+    tool: Tool,
+    embodiment: str | None,
+    timestep: float,
+    coordinates: Sequence[int] = (),
 ) -> mujoco.MjSpec:
     """A table with the tool and, if given, an object.
 
     Args:
         obj: The object; None leaves the table empty.
         physics: Friction and density.
-        tool: Dimensions of the screwdriver.
+        tool: The tool.
         embodiment: ``arm``, ``tool``, or None for a table without a tool.
         timestep: Time step of the simulation [s].
+        coordinates: Numbers of the coordinates in which the tool alone moves, as in `add_carriage`.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "foretrace"
@@ -71,7 +80,7 @@ def build_scene(
     if embodiment == "arm":
         add_arm(spec, tool, physics.tool_friction)
     elif embodiment == "tool":
-        add_carriage(spec, tool, physics.tool_friction)
+        add_carriage(spec, tool, physics.tool_friction, coordinates)
     return spec
 
 

@@ -2,9 +2,9 @@
 
 There is no robot here. What section 5.4 of the paper does with a UR10 is done with lever-ups that differ from those in
 training as a real one would: they are played by another engine with other friction, density and thickness, the blade
-does not meet the object quite where it was told to, the camera's mask is shifted, turned and frayed, the marker's poses
-are noisy, and samples are taken at another rate. All of it is drawn anew for every lever-up. What a stand-in cannot
-show is what no simulator models: bending, screws that loosen, a table that is not flat.
+does not meet the object quite where it is commanded to, the camera's mask is shifted, turned and frayed, the marker's
+poses are noisy, and samples are taken at another rate. All of it is drawn anew for every lever-up. What a stand-in
+cannot show is what no simulator models: bending, screws that loosen, a table that is not flat.
 """
 
 from dataclasses import dataclass, field, fields
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from foretrace.actions import CONTACT_TOLERANCE, LeverUp
 from foretrace.errors import SimulationError, ViewError
 from foretrace.geometry import cross, pose_to_matrix, transform_points
-from foretrace.interactions.record import Effect, Misplacement, Outcome, Physics
+from foretrace.interactions.record import Effect, ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Prism
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
@@ -29,14 +29,14 @@ LONGEST_STEP = 0.002
 
 @dataclass(frozen=True)
 class Perturbation:
-    """By how much one lever-up differs from what predictor and simulator are told."""
+    """Differences of one lever-up from what predictor and simulator are given."""
 
     friction: float
     """Friction coefficient between object and table."""
     tool_friction: float
     """Friction coefficient between object and blade."""
     density_factor: float
-    """Times the density that the simulator is told."""
+    """Multiple of the density that the simulator is given."""
     thickness_error: float
     """How much thicker the object is [m]."""
     contact_along: float
@@ -70,9 +70,9 @@ class StandIn:
     tool_friction: Range = (0.2, 0.4)
     """Friction coefficients between object and blade; 0.3 in training."""
     density_factor: Range = (0.5, 2.0)
-    """Times the density that the simulator is told."""
+    """Multiple of the density that the simulator is given."""
     thickness_error: Range = (-0.002, 0.002)
-    """How much thicker the object is than the simulator is told [m]."""
+    """Thickness of the object beyond the one that the simulator is given [m]."""
     contact_error: float = 0.003
     """The blade meets the object up to this far off, along the edge and across it [m]."""
     direction_error: float = np.deg2rad(3.0)
@@ -153,7 +153,7 @@ class StandIn:
 
         Args:
             obj: The object as it is known.
-            action: The lever-up as it was told.
+            action: The lever-up as commanded.
             perturbation: What is different.
             density: The object's density as it is known [kg/m^3].
 
@@ -162,12 +162,12 @@ class StandIn:
         """
         drawn = perturbation
         real = Prism(obj.corners, obj.height + drawn.thickness_error, obj.bevel)
-        misplaced = Misplacement(drawn.contact_across, drawn.contact_along, drawn.direction_error)
+        error = ExecutionOffset(drawn.contact_across, drawn.contact_along, drawn.direction_error)
         physics = Physics(density * drawn.density_factor, drawn.friction, drawn.tool_friction)
         rng = np.random.default_rng(drawn.noise_seed)
         view = self._see(real, action, drawn, rng)
         simulation = self.simulation(physics)
-        effect = simulate_lever_up(real, action, simulation, misplacement=misplaced).effect
+        effect = simulate_lever_up(real, action, simulation, execution_error=error).effect
         com = self._track(real, effect, rng)
         end = len(com) if effect.slip_index is None else effect.slip_index
         return Observation(
@@ -183,7 +183,7 @@ class StandIn:
     def _see(
         self, real: Prism, action: LeverUp, drawn: Perturbation, rng: np.random.Generator
     ) -> TopDownView:
-        """The object from above, in the told action frame, as a camera with small errors shows it."""
+        """The object from above, in the commanded action's frame, as a camera with small errors shows it."""
         # The mask shifts one way where its frame shifts the other way.
         wrong = action.moved(-drawn.view_shift_x, -drawn.view_shift_y, -drawn.view_turn)
         exact = TopDownView.of(real, wrong)
@@ -194,7 +194,7 @@ class StandIn:
         return TopDownView(mask, np.where(mask, np.float32(real.height), np.float32(0)))
 
     def _track(self, real: Prism, effect: Effect, rng: np.random.Generator) -> Float[np.ndarray, "time 3"]:
-        """Centres of mass in the told action frame [m], from noisy poses of a marker on top of the object."""
+        """Centres of mass in the commanded action's frame [m], from noisy poses of a marker on top of the object."""
         centre = real.mass_properties(1.0).com
         marker = np.array([centre[0], centre[1], real.height])
         count = len(effect.times)
@@ -216,7 +216,7 @@ class Observation:
     """Centre of mass [m]."""
     slip_time: float | None
     """When the object left the blade [s], or None."""
-    outcome: Outcome
+    outcome: str
     """What became of the object."""
     perturbation: Perturbation | None
     """What was different; None: nobody knows."""
