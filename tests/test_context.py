@@ -61,11 +61,11 @@ def test_the_context_is_standardised_by_the_training_part(run, batch):
     tensors = load_file(run / "model.safetensors")
     train = json.loads((run / "split.json").read_text())["train"]  # ids are row numbers here
     for k, name in enumerate(NAMES):
-        values = getattr(batch, name)[train]
+        values = batch.parameters[name][train]
         assert tensors["known_mean"][k] == pytest.approx(values.mean())
         assert tensors["known_scale"][k] == pytest.approx(values.std())
     predictor = load_predictor(run)
-    values = np.stack([batch.friction, batch.density], axis=1)[train]
+    values = np.stack([batch.parameters["friction"], batch.parameters["density"]], axis=1)[train]
     inputs = predictor.add_context(torch.zeros(len(values), 0), values)
     torch.testing.assert_close(inputs.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
     torch.testing.assert_close(inputs.std(0, correction=0), torch.ones(2))
@@ -85,7 +85,10 @@ def test_a_saved_predictor_imagines_the_same_alone_and_in_a_batch(run, batch):
     assert predictor.context == NAMES
     whole = predictor.imagine_batch(batch).com
     for k in (0, 17):
-        context = {"friction": float(batch.friction[k]), "density": float(batch.density[k])}
+        context = {
+            "friction": float(batch.parameters["friction"][k]),
+            "density": float(batch.parameters["density"][k]),
+        }
         alone = predictor.imagine(view_of(batch, k), context=context, com=batch.com[k, 0])
         np.testing.assert_allclose(alone.com_trajectory, whole[k], atol=1e-6)
     context = {"friction": 0.1, "density": 600.0}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from export_samples import fake_data
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
 from foretrace.objects import paper_objects
@@ -52,6 +53,19 @@ def test_predict_a_polygon_with_a_predictor(tmp_path: Path) -> None:
     assert 20 < float(re.findall(r"tilt at the end: ([\d.]+)", printed)[0]) < 80
     assert len(re.findall(r"\d s   x", printed)) == 6
     assert 0 < float(re.findall(r"over the trajectory: ([\d.]+) cm", printed)[0]) < 100
+
+
+@pytest.mark.parametrize(
+    ("example", "printed"),
+    [
+        ("own_predictor.py", r"the centre of mass ends at \[0\.\d+, "),
+        ("own_feature.py", r"^extent \+ LSTM: the centre of mass ends at \["),
+    ],
+)
+def test_own_predictors_and_features(tmp_path: Path, example: str, printed: str) -> None:
+    data = fake_data(tmp_path / "data", num=20)
+    assert re.search(printed, run_python(EXAMPLES / example, data, tmp_path / "run"))
+    assert (tmp_path / "run" / "model.safetensors").is_file()
 
 
 def test_own_object_from_picture(tmp_path: Path) -> None:

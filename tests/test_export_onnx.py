@@ -142,7 +142,7 @@ def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
     inputs = {
         "mask": batch.mask.astype(np.uint8),
         "com": com,
-        "context": batch.friction[:, None].astype("f4"),
+        "context": batch.parameters["friction"][:, None].astype("f4"),
     }
     path, rotation = session.run(None, inputs)
     imagined = predictor.imagine_batch(batch, "estimated")

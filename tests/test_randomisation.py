@@ -8,7 +8,7 @@ from rich.console import Console
 
 import factories
 from engines_at_hand import WITHOUT_BULLET
-from foretrace.actions import USUAL_STROKE, LeverUp, Stroke, ToolPath
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.cli import main
 from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError
 from foretrace.geometry import transform_points
@@ -16,7 +16,7 @@ from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.description import describe_dataset
 from foretrace.interactions.doctor import examine
-from foretrace.interactions.record import AS_TOLD, Interaction, Misplacement, Physics
+from foretrace.interactions.record import NO_OFFSET, ExecutionOffset, Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import NO_BEVEL, Box, Cylinder, Prism
 from foretrace.simulation.collect import CollectConfig, collect, simulate_trial, trial
@@ -42,9 +42,9 @@ def fake_trial(config: CollectConfig, id: int) -> Interaction:
     """What `simulate_trial` draws, without its physics."""
     made = []
 
-    def fake(obj, action, config, *, seed, id, misplacement=AS_TOLD):
+    def fake(obj, action, config, *, seed, id, execution_error=NO_OFFSET):
         made.append(replace(factories.fake_lever_up(obj, action, id=id, seed=seed), physics=config.physics))
-        return replace(made[0], misplacement=misplacement)
+        return replace(made[0], execution_error=execution_error)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake)
@@ -53,7 +53,7 @@ def fake_trial(config: CollectConfig, id: int) -> Interaction:
 
 def drawn(randomisation: Randomisation, seed: int) -> dict[str, float]:
     """What one lever-up of a prism gets."""
-    obj, physics, path, misplacement = randomisation.vary(
+    obj, physics, path, error = randomisation.vary(
         PENTAGON, Physics(), ToolPath(), np.random.default_rng(seed)
     )
     assert isinstance(obj, Prism)
@@ -64,8 +64,8 @@ def drawn(randomisation: Randomisation, seed: int) -> dict[str, float]:
         "thickness_factor": obj.height / PENTAGON.height,
         "bevel_width_factor": obj.bevel.width / PENTAGON.bevel.width,
         "bevel_height_factor": obj.bevel.height / PENTAGON.bevel.height,
-        **{f"misplaced_{name}": value for name, value in asdict(misplacement).items()},
-        **asdict(Stroke.of(path)),
+        **{f"execution_{name}": value for name, value in asdict(error).items()},
+        **path.parameters(),
     }
 
 
@@ -105,8 +105,8 @@ def test_what_was_drawn_before_the_action_varied_is_drawn_still():
     numbers = drawn(RANDOMISED, 5)
     shares = np.random.default_rng(5).random(9)
     assert numbers["friction"] == 0.5 + shares[0] * (1.1 - 0.5)
-    assert numbers["misplaced_turn"] == np.deg2rad(3.0) * (2 * shares[8] - 1)
-    assert {name: numbers[name] for name in asdict(USUAL_STROKE)} == asdict(USUAL_STROKE)
+    assert numbers["execution_turn"] == np.deg2rad(3.0) * (2 * shares[8] - 1)
+    assert numbers.items() >= LeverUp.nominal_parameters().items()
 
 
 def test_fast_and_slow_blades_end_at_the_same_time():
@@ -143,9 +143,9 @@ def test_objects_without_thickness_or_bevel_stay_as_they_are():
         ("thickness_factor", (0.5, float("inf"))),
         ("insertion", (0.03, 0.01)),
         ("speed", (0.0, 1.0)),
-        ("misplaced_ahead", 0.02),
-        ("misplaced_left", -0.001),
-        ("misplaced_turn", float("nan")),
+        ("execution_ahead", 0.02),
+        ("execution_left", -0.001),
+        ("execution_turn", float("nan")),
     ],
 )
 def test_impossible_randomisations_are_refused(setting, value):
@@ -170,7 +170,7 @@ def test_objects_and_actions_are_those_of_the_plain_data_set():
         np.testing.assert_array_equal(plain.object.corners, varied.object.corners)
         np.testing.assert_array_equal(plain.action.contact, varied.action.contact)
         assert plain.provenance.seed == varied.provenance.seed
-        assert plain.misplacement == AS_TOLD
+        assert plain.execution_error == NO_OFFSET
         assert plain.physics == Physics()
         assert varied.physics != fake_trial(VARIED, id + 1).physics
         assert varied.physics == fake_trial(replace(VARIED, objects=16), id).physics
@@ -191,12 +191,12 @@ def test_what_was_drawn_is_recorded(varied):
     again = fake_trial(VARIED, 42)
     stored = dataset.with_id(42)
     assert stored.physics == again.physics
-    assert stored.misplacement == again.misplacement != AS_TOLD
+    assert stored.execution_error == again.execution_error != NO_OFFSET
     assert stored.object.to_dict() == again.object.to_dict()
     assert storage.read_manifest(varied)["configuration"]["randomisation"]["friction"] == [0.5, 1.1]
     numbers = dataset.table["object_id"].to_pylist()
     assert Counter(numbers) == {k: 2 * (3 + k) for k in range(8)}
-    assert np.ptp(dataset.batch().friction) > 0.5
+    assert np.ptp(dataset.batch().parameters["friction"]) > 0.5
 
 
 def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
@@ -215,11 +215,11 @@ def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
     for name in manifest["shards"]:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes((varied / name).read_bytes())
-    manifest["configuration"]["randomisation"] |= {"friction": [0.5, 0.51], "misplaced_left": 1e-4}
+    manifest["configuration"]["randomisation"] |= {"friction": [0.5, 0.51], "execution_left": 1e-4}
     storage.write_manifest(tmp_path, manifest)
     problems = [finding.problem for finding in examine(tmp_path).findings]
     assert any("friction = " in p and "was not drawn from 0.5 to 0.51" in p for p in problems)
-    assert any("misplaced_left = " in p and "from -0.0001 to 0.0001" in p for p in problems)
+    assert any("execution_left = " in p and "from -0.0001 to 0.0001" in p for p in problems)
 
 
 def test_a_plain_folder_is_not_gone_on_with_randomised(tmp_path):
@@ -228,17 +228,6 @@ def test_a_plain_folder_is_not_gone_on_with_randomised(tmp_path):
         DatasetError, match=r"begun with randomisation\.bevel_height_factor = None, asked for"
     ):
         collect(VARIED, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
-    manifest = storage.read_manifest(tmp_path)
-    del manifest["configuration"]["randomisation"]  # as older data sets have it
-    first = storage.shard_name(0)
-    older = storage.read_shard(tmp_path, first)[0].drop_columns([*LARGEST, *storage.STROKE_COLUMNS])
-    manifest["shards"][first] = storage.write_shard(tmp_path, first, older)
-    storage.write_manifest(tmp_path, manifest)
-    collect(PLAIN, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
-    assert examine(tmp_path).findings == ()
-    assert Dataset.open(tmp_path)[0].misplacement == AS_TOLD
-    assert Dataset.open(tmp_path)[0].stroke == USUAL_STROKE
-    assert Dataset.open(tmp_path).batch().sweep[0] == ToolPath.sweep
 
 
 def test_simulate_randomise_from_the_command_line(tmp_path):
@@ -258,12 +247,12 @@ def test_simulate_vary_action_from_the_command_line(tmp_path):
     assert main([*command, "--out", str(tmp_path / "both"), "--randomise"]) == 0
     action, both = (Dataset.open(tmp_path / name) for name in ("action", "both"))
     assert {len(row.effect.times) for row in action} == {round(ToolPath().faster(2 / 3).duration / 0.05) + 1}
-    assert [row.stroke for row in action] == [row.stroke for row in both]
-    assert len({row.stroke for row in action}) == 3
+    assert [row.action.path for row in action] == [row.action.path for row in both]
+    assert len({row.action.path for row in action}) == 3
     assert {row.physics for row in action} == {Physics()}
     assert len({row.physics for row in both}) == 3
     for row in action:
-        path = row.stroke.path()
+        path = row.action.path
         tip = row.effect.tool_trajectory[:, :3]
         np.testing.assert_allclose(tip[:, [0, 2]], path.at(row.effect.times)[:, :2], atol=1e-3)
     assert examine(tmp_path / "both").findings == ()
@@ -289,32 +278,34 @@ def test_the_manifest_names_the_engines_own_library(tmp_path):
         assert other not in versions
 
 
-# --- misplaced blades -----------------------------------------------------------------------------------------
+# --- execution errors -----------------------------------------------------------------------------------------
 
 
-def test_a_misplaced_blade_is_told_in_the_frame_that_was_asked_for():
+def test_an_execution_error_is_recorded_in_the_commanded_frame():
     action = LeverUp.at_edge(PENTAGON, 1)
-    error = Misplacement(0.002, -0.003, 0.05)
-    told = simulate_lever_up(PENTAGON, action, TOOL, misplacement=error)
+    error = ExecutionOffset(0.002, -0.003, 0.05)
+    commanded = simulate_lever_up(PENTAGON, action, TOOL, execution_error=error)
     done = simulate_lever_up(PENTAGON, action.moved(0.002, -0.003, 0.05), TOOL)
-    np.testing.assert_array_equal(told.view.mask, TopDownView.of(PENTAGON, action).mask)
+    np.testing.assert_array_equal(commanded.view.mask, TopDownView.of(PENTAGON, action).mask)
     com = transform_points(action.T_action_object, PENTAGON.mass_properties(1.0).com[None])[0]
-    np.testing.assert_allclose(told.effect.com_trajectory[0], com, atol=1e-4)
+    np.testing.assert_allclose(commanded.effect.com_trajectory[0], com, atol=1e-4)
     # The same motion of the same object, seen from another frame.
-    T_told_done = action.T_action_object @ np.linalg.inv(done.action.T_action_object)
+    T_commanded_executed = action.T_action_object @ np.linalg.inv(done.action.T_action_object)
     for name in ("pose_trajectory", "tool_trajectory", "com_trajectory"):
-        there = transform_points(T_told_done, getattr(done.effect, name)[:, :3])
-        np.testing.assert_allclose(getattr(told.effect, name)[:, :3], there, atol=1e-12)
-    np.testing.assert_allclose(told.effect.tool_trajectory[0, :2], [-0.006, -0.003], atol=1e-3)
+        there = transform_points(T_commanded_executed, getattr(done.effect, name)[:, :3])
+        np.testing.assert_allclose(getattr(commanded.effect, name)[:, :3], there, atol=1e-12)
+    np.testing.assert_allclose(commanded.effect.tool_trajectory[0, :2], [-0.006, -0.003], atol=1e-3)
     corners = transform_points(
         action.T_action_object, np.column_stack([PENTAGON.support_corners, np.zeros(5)])
     )
-    pair = corners[list(told.effect.support_corners), :2]
-    np.testing.assert_allclose(told.effect.support_points, pair, atol=1e-12)
-    assert told.effect.outcome == done.effect.outcome
-    assert told.misplacement == error
+    pair = corners[list(commanded.effect.support_corners), :2]
+    np.testing.assert_allclose(commanded.effect.support_points, pair, atol=1e-12)
+    assert commanded.effect.outcome == done.effect.outcome
+    assert commanded.execution_error == error
 
 
-def test_what_is_told_must_lie_on_the_outline_however_the_blade_errs():
+def test_the_commanded_contact_must_lie_on_the_outline_however_the_blade_errs():
     with pytest.raises(ActionError, match="from the object's outline"):
-        simulate_lever_up(PENTAGON, LeverUp((0.0, 0.0), (1.0, 0.0)), TOOL, misplacement=Misplacement(0.001))
+        simulate_lever_up(
+            PENTAGON, LeverUp((0.0, 0.0), (1.0, 0.0)), TOOL, execution_error=ExecutionOffset(0.001)
+        )

@@ -8,7 +8,7 @@ from rich.console import Console
 
 import factories
 from engines_at_hand import WITHOUT_BULLET
-from foretrace.actions import LeverUp, Stroke, ToolPath
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.cli import main
 from foretrace.errors import DatasetError, ResultsError
 from foretrace.evaluation.results import Trial, read_results
@@ -55,7 +55,7 @@ def fake_simulate(config: CollectConfig, id: int):
     outcome = Outcome.SLIPPED if id % (5 if varied else 13) == 3 else Outcome.LEVERED
     made = factories.fake_lever_up(obj, action, id=id, seed=seed, num_samples=12, outcome=outcome)
     _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
-    return replace(made, physics=physics, stroke=Stroke.of(path))
+    return replace(made, physics=physics, action=replace(made.action, path=path))
 
 
 @pytest.fixture(scope="module")
@@ -160,12 +160,14 @@ def test_who_knows_is_told_the_stand_ins_constants_or_the_usual_ones(shown, monk
     found = distances(predictor, shown)
     distances(predictor, shown, nominal=True)
     true, nominal = seen
-    np.testing.assert_allclose(true.friction, [each.observed.perturbation.friction for each in shown])
+    np.testing.assert_allclose(
+        true.parameters["friction"], [each.observed.perturbation.friction for each in shown]
+    )
     factors = [each.observed.perturbation.density_factor for each in shown]
-    np.testing.assert_allclose(true.density, 700 * np.array(factors))
-    assert nominal.friction.tolist() == [0.8] * 3
-    assert nominal.tool_friction.tolist() == [0.3] * 3
-    assert nominal.density.tolist() == [700.0] * 3
+    np.testing.assert_allclose(true.parameters["density"], 700 * np.array(factors))
+    assert nominal.parameters["friction"].tolist() == [0.8] * 3
+    assert nominal.parameters["tool_friction"].tolist() == [0.3] * 3
+    assert nominal.parameters["density"].tolist() == [700.0] * 3
     np.testing.assert_allclose(true.com[:, 0], [each.observed.com[0] for each in shown])
     assert found.keys() == {"stand_in_printed", "stand_in_everyday"}
     assert min(found.values()) > 0.1
@@ -232,9 +234,9 @@ def test_actions_that_vary_are_told_without_a_stand_in(folders, tmp_path, monkey
     assert not table["metric"].str.contains("stand_in").any()
     assert table.groupby("setting")["metric"].nunique().to_dict() == {PLAIN: 6, VARIED: 6, KNOWING: 8}
     assert {known for known, _ in told} == {tuple(PARAMETERS)}
-    spreads = [np.ptp(batch.sweep) > 0.1 for _, batch in told]
+    spreads = [np.ptp(batch.parameters["sweep"]) > 0.1 for _, batch in told]
     assert spreads == [False, False, True, False]  # plain, told the usual, varied, told the usual
-    assert set(told[3][1].sweep) == {ToolPath.sweep}
+    assert set(told[3][1].parameters["sweep"]) == {ToolPath.sweep}
     assert list(summarise(table)["none"]) == ["plain test", "randomised test"]
     assert [label.get_text() for label in randomisation_figure(table).axes[0].get_xticklabels()] == [
         *("plain test", "randomised test")

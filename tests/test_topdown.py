@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import ViewError
 from foretrace.geometry import polygon_area
-from foretrace.interactions.topdown import METRES_PER_PIXEL, VIEW_SIZE, TopDownView
-from foretrace.objects import MeshObject, Prism, sample_prism
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
+from foretrace.objects import Box, MeshObject, Prism, sample_prism
 
 SILHOUETTES = sorted((Path(__file__).parents[1].parent / "shared" / "data" / "silhouettes").glob("*.png"))
 
@@ -261,3 +261,47 @@ def test_mesh_and_prism_of_the_same_body_look_the_same():
     shift = body.center_mass[:2]
     view = TopDownView.of(mesh, LeverUp(action.contact - shift, action.direction))
     np.testing.assert_array_equal(view.mask, TopDownView.of(prism, action).mask)
+
+
+@pytest.mark.parametrize("scale", [0.0016, 0.0025, 0.0064])
+def test_images_of_another_scale_are_resampled(scale):
+    box = Box(0.09, 0.06, 0.03)
+    exact = TopDownView.of(box, LeverUp.at_edge(box, 0))
+    rows, columns = np.indices((VIEW_SIZE, VIEW_SIZE))
+    x, y = (CONTACT_PIXEL[0] - rows) * scale, (CONTACT_PIXEL[1] - columns) * scale
+    mask = (x > 0) & (x < 0.06) & (np.abs(y) < 0.045)
+    view = TopDownView(mask, np.where(mask, 0.03, 0.0), scale)
+    assert view.metres_per_pixel == METRES_PER_PIXEL
+    assert np.count_nonzero(view.mask) == pytest.approx(np.count_nonzero(exact.mask), rel=0.07)
+    np.testing.assert_allclose(view.height[view.mask], 0.03, rtol=1e-5)
+    low, high = view.contour().min(axis=0), view.contour().max(axis=0)
+    np.testing.assert_allclose([*low, *high], [0, -0.045, 0.06, 0.045], atol=0.004)
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.003, np.nan])
+def test_impossible_scales_are_refused(scale):
+    with pytest.raises(ViewError, match="it must be a positive length"):
+        TopDownView(np.zeros((128, 128), bool), np.zeros((128, 128)), scale)
+
+
+def test_an_object_cut_off_by_a_small_view_is_refused():
+    mask = np.zeros((128, 128), bool)
+    mask[:96, 60:70] = True
+    with pytest.raises(ViewError, match=r"touches the border of a view of 0.0016 m per pixel"):
+        TopDownView(mask, 0.02 * mask, 0.0016)
+
+
+def test_the_object_is_seen_from_another_action():
+    rng = np.random.default_rng(2)
+    prism = sample_prism(rng, 6)
+    first, *others = [LeverUp.at_edge(prism, edge, 0.4) for edge in range(6)]
+    view, T = TopDownView.of(prism, first), first.T_action_object
+    for other in others:
+        moved = LeverUp(T[:2, :2] @ other.contact + T[:2, 3], T[:2, :2] @ other.direction)
+        seen, exact = view.seen_from(moved), TopDownView.of(prism, other)
+        assert np.count_nonzero(seen.mask ^ exact.mask) < 0.04 * np.count_nonzero(exact.mask)
+        both = seen.mask & exact.mask
+        np.testing.assert_allclose(seen.height[both], exact.height[both], atol=0.003)
+    same = view.seen_from(LeverUp((0.0, 0.0), (1.0, 0.0)))
+    np.testing.assert_array_equal(same.mask, view.mask)
+    np.testing.assert_array_equal(same.height, view.height)

@@ -449,22 +449,6 @@ def test_what_features_learned_is_learned_once(tmp_path, batch, monkeypatch):
         fit_predictor(batch, config, halves(batch), training, fitted=tmp_path)
 
 
-def test_four_interactions_are_learned_by_heart(tmp_path):
-    four = fake_batch(np.random.default_rng(11), 4, num_samples=16)
-    everything = Split(np.arange(4), np.arange(4), np.arange(4))
-    options = {"width": 32, "dropout": 0.0}
-    config = LstmConfig(features="im-cnn", feature_options=options, hidden=64)
-    training = TrainConfig(epochs=60, batch_size=4, learning_rate=3e-3, device="cpu")
-    run = train(four, tmp_path / "run", training, config, split=everything)
-    imagined = load_predictor(run).imagine_batch(four)
-    before, after = (
-        float(rows(run)[0]["validation_full_cm"]),
-        100 * mean_distance(imagined.com, four.com).mean(),
-    )
-    assert after < 0.25 * before
-    assert after < 0.35
-
-
 def test_evaluation_rows(tmp_path, batch):
     run = train(batch, tmp_path / "run")
     predictor = load_predictor(run)

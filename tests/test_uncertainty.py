@@ -18,7 +18,7 @@ from foretrace.experiments.uncertainty_metrics import ALL, Part
 from foretrace.experiments.uncertainty_report import markdown, summarise
 from foretrace.experiments.uncertainty_scores import constant_deviations, score
 from foretrace.imagined import LEVELS
-from foretrace.interactions.record import AS_TOLD, Outcome
+from foretrace.interactions.record import NO_OFFSET, Outcome
 from foretrace.predictor import Futures, ImaginedBatch, load_predictor
 from foretrace.predictor.states import decode_poses
 from foretrace.simulation.collect import CollectConfig, collect
@@ -226,7 +226,7 @@ def fake_simulate(config, id):
         outcome=Outcome.SLIPPED if id % 4 == 1 else Outcome.LEVERED,
         num_samples=20,
     )
-    return replace(interaction, misplacement=AS_TOLD)
+    return replace(interaction, execution_error=NO_OFFSET)
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +312,7 @@ def test_other_physics_are_judged_at_the_same_times(folder):
 def test_data_without_motions_are_refused(tmp_path):
     def never_moved(config, id):
         interaction = factories.fake_interaction(np.random.default_rng(id), id, num_samples=1)
-        return replace(interaction, misplacement=AS_TOLD)
+        return replace(interaction, execution_error=NO_OFFSET)
 
     collect(CollectConfig(1, 1), tmp_path, workers=1, console=QUIET, simulate=never_moved)
     with pytest.raises(DatasetError, match="motion of two samples"):

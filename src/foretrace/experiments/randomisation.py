@@ -108,7 +108,7 @@ def open_both(plain: str | Path, varied: str | Path, names: Sequence[str] = NAME
     both = Both(load_levered(plain), load_levered(varied))
     for name in names:
         remedy = "--randomise" if name in CONSTANTS else "--vary-action"
-        spans = [np.ptp(getattr(batch, name)) if len(batch) else 0.0 for batch in both]
+        spans = [np.ptp(batch.parameters[name]) if len(batch) else 0.0 for batch in both]
         if spans[0] > 0:
             raise ResultsError(f"{name} varies in {plain}: simulate the plain data without {remedy}")
         if spans[1] == 0:
@@ -202,7 +202,7 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     told = [Physics(density=each.subject.density) if nominal else each.observed.physics for each in shown]
     values = [true_values(physics, tuple(KNOWN)) for physics in told]
     known = {name: np.array([each[name] for each in values]) for name in KNOWN}
-    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), **known)
+    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), parameters=known)
     imagined = predictor.imagine_batch(batch).com
     values = np.array(
         [distance_until_slip(each.observed, times, path) for each, path in zip(shown, imagined, strict=True)]
@@ -270,7 +270,8 @@ def run_randomisation(
 def _nominal(batch: InteractionBatch) -> InteractionBatch:
     """The same interactions as if the usual constants and the usual action were all that is known of them."""
     usual = true_values(Physics(), tuple(KNOWN))
-    return replace(batch, **{name: np.full(len(batch), value) for name, value in usual.items()})
+    constant = {name: np.full(len(batch), value) for name, value in usual.items()}
+    return replace(batch, parameters=batch.parameters | constant)
 
 
 @lru_cache(maxsize=1)

@@ -133,6 +133,11 @@ class EffectPredictor(Imaginer, nn.Module):
         return f"{self.features.label} + {self.label}"
 
     @property
+    def is_symmetric(self) -> bool:
+        """Whether mirror images have mirrored motions, exactly; by default not."""
+        return False
+
+    @property
     def feature_weights(self) -> list[nn.Parameter]:
         """Weight matrices of the features, which decay with the number of features; none by default."""
         return []

@@ -149,6 +149,11 @@ class OneShotPredictor(EffectPredictor):
         """Name in figures and tables."""
         return self.label
 
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether mirror images have mirrored motions, exactly."""
+        return self.config.mirrored
+
     def lengths(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
         """Whole trajectories: the fall after a slip is an effect, too."""
         return batch.length
