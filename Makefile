@@ -34,7 +34,7 @@ bench: setup
 	for name in simulate agreement training; do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 figures: setup
-	$(BIN)/foretrace figures docs/results/paper
+	$(BIN)/foretrace evaluate paper --out docs/results/paper --redraw
 
 # The predictor that comes with the package: some 20 minutes on two cores.
 checkpoint: setup

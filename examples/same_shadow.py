@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 import foretrace as ft
-from foretrace.experiments.non_flat import non_flat_figure
 from foretrace.objects import Cylinder, look_alikes
+from foretrace.pictures.look_alikes import non_flat_figure
 
 
 def main(out: Path) -> None:

@@ -3,14 +3,20 @@
 Each object turns rigidly about the closed-form support edge, so that there is something to learn.
 """
 
-import numpy as np
+from dataclasses import replace
+from pathlib import Path
 
-from foretrace.actions import LeverUp
+import numpy as np
+from rich.console import Console
+
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.geometry import continuous_quaternions, matrix_to_pose
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
+from foretrace.simulation.collect import CollectConfig, collect, trial
+from foretrace.simulation.randomisation import NOTHING, Randomisation
 
 SAMPLE_PERIOD = 0.05
 FINAL_TILT = np.radians(40)
@@ -101,6 +107,23 @@ def fake_lever_up(
         provenance=Provenance(seed=seed, versions={"foretrace": "0.1.0"}),
         id=id,
     )
+
+
+def fake_data_set(
+    folder: Path, drawn: Randomisation = NOTHING, objects: int = 8, num_samples: int = 12
+) -> Path:
+    """A data set of made-up motions, with what varies drawn as told, and then more slips."""
+    config = CollectConfig(objects, 1, randomisation=drawn)
+
+    def simulate(config: CollectConfig, id: int) -> Interaction:
+        obj, action, seed = trial(config, id)
+        outcome = Outcome.SLIPPED if id % (13 if drawn == NOTHING else 5) == 3 else Outcome.LEVERED
+        made = fake_lever_up(obj, action, id=id, seed=seed, num_samples=num_samples, outcome=outcome)
+        _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
+        return replace(made, physics=physics, action=replace(made.action, path=path))
+
+    collect(config, folder, workers=1, console=Console(quiet=True), simulate=simulate)
+    return folder
 
 
 def support_corners(corners: np.ndarray, com: np.ndarray) -> tuple[int, int]:

@@ -6,17 +6,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import factories
 from foretrace import cli
-from foretrace.evaluation.results import read_results
+from foretrace.evaluation.storage import read_rows
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
-from foretrace.predictor.training import fit_predictor
 
 
 @pytest.fixture
@@ -132,51 +130,47 @@ def test_show_refuses_what_it_cannot_draw(folder, capsys):
     assert "no interaction 104" in capsys.readouterr().err
 
 
-def test_evaluate_paper_goes_on_and_prints_what_it_found(folder, tmp_path, capsys, monkeypatch):
-    def train_little(batch, config, *arguments, **options):
-        return fit_predictor(batch, replace(config, hidden=4, min_steps=1), *arguments, **options)
-
-    monkeypatch.setattr("foretrace.experiments.paper_protocol.fit_predictor", train_little)
+def test_evaluate_goes_on_and_prints_what_it_found(folder, tmp_path, capsys):
     out = tmp_path / "results"
-    command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1 --epochs 1".split()
-    command += ["--experiments", "features", "support-points", "--settings", "shuffled", "100"]
-    command += ["--features", "none", "sp-rule"]
+    command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1".split()
+    command += ["--experiments", "support-points", "support-points-plain", "--settings", "50", "100"]
+    command += ["--features", "chance", "sp-rule"]
     capsys.readouterr()
     assert cli.main([*command, "--seeds", "0", "1", "--dry-run"]) == 0
     assert capsys.readouterr().out.split() == [
-        *("features", "4", "trainings", "missing"),
-        *("support-points", "2", "trainings", "missing"),
+        *("support-points", "8", "trials", "missing"),
+        *("support-points-plain", "2", "trials", "missing"),
     ]
     assert not out.exists()
     assert cli.main([*command, "--seeds", "0"]) == 0
     assert cli.main([*command, "--seeds", "0", "1", "--dry-run"]) == 0
-    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()[-2:]] == ["2", "1"]
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()[-2:]] == ["4", "1"]
     assert cli.main([*command, "--seeds", "0", "1"]) == 0
     printed = capsys.readouterr()
-    assert "3 of 6 trainings are there already" in printed.err
-    assert "features: mean error in cm, 95 % interval (seeds)" in printed.out
-    table = read_results(out)
-    values = table[(table["metric"] == "full") & (table["features"] == "none")]["value"]
-    assert f"{values.mean():.3f} (2)" in printed.out
-    assert f"{values.min():.3f} to {values.max():.3f}" in printed.out
-    assert printed.out.splitlines()[-1] == f"results: {out}"
-    with (out / "results.csv").open("a") as file:
-        file.write("features,none,2,shuffled,full,0.1\n")
-    assert cli.main([*command, "--seeds", "0", "1"]) == 0
-    assert read_results(out).equals(table)
+    assert "5 of 10 trials are there already" in printed.err
+    assert "support-points: share with both support points right" in printed.out
+    table = read_rows(out)
+    rows = table[
+        (table["metric"] == "accuracy") & (table["features"] == "chance") & (table["setting"] == "100")
+    ]
+    assert f"{rows[rows['experiment'] == 'support-points']['value'].mean():.3f} (2)" in printed.out
+    assert str(out / "summary.json") in printed.out.splitlines()
     assert cli.main([*command, "--epochs", "2"]) == 2
-    assert "recipe.epochs = 1, asked for is 2" in capsys.readouterr().err
+    assert "epochs = 15, asked for is 2" in capsys.readouterr().err
 
 
-def test_evaluate_paper_tells_of_trainings_that_failed(fake_physics, tmp_path, capsys):
+def test_evaluate_reports_trials_that_failed(fake_physics, tmp_path, capsys):
     folder, out = tmp_path / "data", tmp_path / "results"
     assert cli.main(["simulate", "--out", str(folder), "--objects", "5", "--workers", "1"]) == 0
     command = f"evaluate paper --data {folder} --out {out} --proportional --seeds 0 --workers 1".split()
     command += ["--experiments", "support-points-novel", "--features", "chance"]
     assert cli.main(command) == 1
     printed = capsys.readouterr().err
-    assert "failed: support-points-novel 9&10, chance, seed 0: no object has [9, 10] corners" in printed
-    assert set(read_results(out)["setting"]) == {"3&4", "5&6"}
+    assert (
+        "failed: experiment support-points-novel, features chance, seed 0, setting 9&10: no object has"
+        in printed
+    )
+    assert set(read_rows(out)["setting"]) == {"3&4", "5&6"}
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from foretrace.interactions.record import Interaction, Outcome
 from foretrace.objects import Prism
 from foretrace.objects.surface import faces_of
 from foretrace.pictures import animation
-from foretrace.pictures import scene as figures
-from foretrace.pictures.scene import Scene, contact_sheet, interaction_figure, scene_figure
+from foretrace.pictures.contact_sheet import contact_sheet
+from foretrace.pictures.scene import Scene, interaction_figure, scene_figure, silhouette
+from foretrace.pictures.style import PREDICTION_COLORS, TRUTH_COLOR
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +65,9 @@ def test_interaction_figure_shows_truth_and_predictions_in_cm(interaction):
     assert "Interaction 4: 7 corners, slipped" in shown
     assert any("im-cnn (mean error 0.50 cm, at the end 0.50 cm)" in text for text in shown)
     assert any("none (mean error 0.00 cm" in text for text in shown)
-    from_above, truth = paths_drawn(fig, 0, figures.TRUTH_COLOR), com[:, [1, 0]] * 100
+    from_above, truth = paths_drawn(fig, 0, TRUTH_COLOR), com[:, [1, 0]] * 100
     np.testing.assert_allclose(from_above[0], truth)
-    heights = paths_drawn(fig, 4, figures.PREDICTION_COLORS[0])
+    heights = paths_drawn(fig, 4, PREDICTION_COLORS[0])
     np.testing.assert_allclose(heights[0], np.column_stack([interaction.effect.times, com[:, 2] * 100 + 0.5]))
     left, right = fig.axes[0].get_xlim()
     assert left > right, "left is left: y grows to the left"
@@ -83,7 +84,7 @@ def test_interaction_figure_without_support_points_or_predictions(interaction, t
 def test_predictions_may_be_longer_than_the_truth(interaction):
     com = interaction.effect.com_trajectory
     longer = np.concatenate([com, com[-1:], com[-1:]])
-    heights = paths_drawn(interaction_figure(interaction, {"a": longer}), 4, figures.PREDICTION_COLORS[0])
+    heights = paths_drawn(interaction_figure(interaction, {"a": longer}), 4, PREDICTION_COLORS[0])
     assert heights[0][-1, 0] == pytest.approx(interaction.effect.times[-1] + 2 * factories.SAMPLE_PERIOD)
 
 
@@ -108,7 +109,7 @@ def test_an_imagined_lever_up_needs_no_truth(interaction, tmp_path):
 
 def test_silhouette_spans_the_object():
     square = Prism(np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]]), height=0.03)
-    (ring,) = figures.silhouette(square, np.array([0.2, 0, 0.1, 1, 0, 0, 0]))
+    (ring,) = silhouette(square, np.array([0.2, 0, 0.1, 1, 0, 0, 0]))
     np.testing.assert_allclose(ring.min(axis=0), [0.15, 0.10], atol=1e-4)
     np.testing.assert_allclose(ring.max(axis=0), [0.25, 0.13], atol=1e-4)
 

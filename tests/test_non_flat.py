@@ -10,7 +10,6 @@ from PIL import Image
 
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError
-from foretrace.experiments.non_flat import non_flat_figure
 from foretrace.geometry import polygon_area
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.description import describe_dataset
@@ -18,6 +17,7 @@ from foretrace.interactions.record import Interaction, Physics
 from foretrace.objects import Cylinder, look_alikes
 from foretrace.objects.surface import faces_of
 from foretrace.pictures.animation import frames
+from foretrace.pictures.look_alikes import non_flat_figure
 from foretrace.pictures.scene import Scene, interaction_figure
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from foretrace.experiments.non_flat_errors import NonFlatData, example_paths, measure, spread_of_fates
+from foretrace.experiments.non_flat_report import errors_figure, markdown, paths_figure, summarise
 from PIL import Image
 
 from foretrace.cli import main
 from foretrace.errors import DatasetError
 from foretrace.experiments import non_flat_errors
-from foretrace.experiments.non_flat_errors import NonFlatData, example_paths, measure, spread_of_fates
-from foretrace.experiments.non_flat_report import errors_figure, markdown, paths_figure, summarise
 from foretrace.imagined import ImaginedBatch
 from foretrace.predictor import TrainConfig, train_predictor
 from foretrace.predictor.base import EffectPredictor

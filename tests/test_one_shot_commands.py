@@ -15,7 +15,7 @@ import factories
 import foretrace as ft
 from export_samples import write_data
 from foretrace import cli
-from foretrace.cli.futures import futures_content, outlook_of, radius_of, say_futures
+from foretrace.cli.futures import futures_content, prediction_band, radius_of, say_futures
 from foretrace.errors import CheckpointError
 from foretrace.imagined import LEVELS, conformal_scores
 from foretrace.interactions.dataset import Dataset
@@ -95,7 +95,7 @@ def test_nobody_says_more_than_is_known(capsys):
     assert "not known" in capsys.readouterr().out
     assert radius_of(unsure) is None
     assert futures_content(unsure)["futures"][0]["radius"] is None
-    assert outlook_of(unsure).radius is None
+    assert prediction_band(unsure).radius is None
     com = unsure.com_trajectory[None]
     single = replace(unsure, futures=Futures.point(com, None, "levered"))
     say_futures(single)
@@ -116,19 +116,19 @@ def test_futures_are_written_in_the_order_of_their_probability():
 
 def test_less_probable_futures_and_the_region_are_drawn():
     effect = imagined_effect()
-    outlook = outlook_of(effect)
-    assert [name for name, _ in outlook.others] == ["slipped 25%", "levered 4%"]
-    np.testing.assert_allclose(outlook.radius[-1], 0.02)
+    band = prediction_band(effect)
+    assert [name for name, _ in band.others] == ["slipped 25%", "levered 4%"]
+    np.testing.assert_allclose(band.radius[-1], 0.02)
     prism = ft.Prism([(0, -0.06), (0.12, -0.06), (0.12, 0.06), (0, 0.06)])
     action = ft.LeverUp.at_edge(prism, 3)
     scene = Scene.imagined(prism, action, effect.times, {"one-shot": effect.com_trajectory})
-    plain, drawn = scene_figure(scene), scene_figure(replace(scene, outlook=outlook))
+    plain, drawn = scene_figure(scene), scene_figure(replace(scene, band=band))
     for before, after in zip(plain.axes, drawn.axes, strict=True):
         assert len(after.lines) == len(before.lines) + 2
         assert (
             len(after.patches) + len(after.collections) == len(before.patches) + len(before.collections) + 1
         )
-    labels = [handle.get_label() for handle in legend_of(replace(scene, outlook=outlook))]
+    labels = [handle.get_label() for handle in legend_of(replace(scene, band=band))]
     assert labels[1:] == ["region of 90%", "less probable: slipped 25%, levered 4%"]
     # The region is as wide as its radius says, and in sight.
     above = drawn.axes[0]

@@ -8,10 +8,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from foretrace import cli
-from foretrace.evaluation.results import ResultsTable, Trial
-from foretrace.experiments.charts import seeds_in_words
-from foretrace.experiments.claims import CLAIMS
-from foretrace.experiments.paper_figures import FIGURES, write_figures
+from foretrace.errors import ResultsError
+from foretrace.evaluation.charts import STYLES, family_of, present, seeds_in_words, style_of
+from foretrace.evaluation.run import run_experiment, write_figures
+from foretrace.evaluation.storage import REPORT, ROWS, SUMMARY, summary_content
+from foretrace.experiments.paper import Paper
+from foretrace.experiments.paper_claims import CLAIMS
+from foretrace.experiments.paper_figures import FIGURES
+from foretrace.files import write_json
 from result_tables import ERRORS, paper_like
 
 
@@ -94,74 +98,64 @@ def test_seeds_are_counted():
     assert seeds_in_words(rows[2:]) == "1 seed"
 
 
+@pytest.mark.parametrize("name", ["figure-10a", "figure-11", "figure-13"])
+def test_what_has_no_style_of_its_own_is_drawn_with_its_label(name, table):
+    own = table[table["features"].eq("sc-800")].assign(features="my-features")
+    fig = FIGURES[name](pd.concat([table, own]))
+    assert fig is not None
+    assert "my-features" in words(fig).split("\n")
+    assert style_of("my-features") == style_of("my-features") not in STYLES.values()
+    assert family_of("my-features") == "others"
+    assert present(pd.concat([own, table]))[-1] == "my-features"
+
+
 def test_the_same_table_gives_the_same_bytes(table, tmp_path):
     some = table[table["experiment"].isin(["support-points", "features"])]
-    told: list[str] = []
-    first = write_figures(some, tmp_path / "a", report=told.append)
-    second = write_figures(some, tmp_path / "b", report=told.append)
-    assert [path.name for path in first] == [
+    files = []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        files.append(write_figures(Paper().figures(some), folder, Paper.formats))
+    assert [path.name for path in files[0]] == [
         f"{name}.{suffix}"
         for name in ("figure-9a", "figure-10a", "figure-10b", "figure-10-by-object")
         for suffix in ("png", "svg")
     ]
-    for one, other in zip(first, second, strict=True):
+    for one, other in zip(*files, strict=True):
         assert one.read_bytes() == other.read_bytes()
-    assert told[: len(told) // 2] == [
-        f"{name} is left out: no rows for it" for name in ("figure-9b", "figure-11", "figure-12", "figure-13")
-    ]
-    with Image.open(first[0]) as picture:
+    with Image.open(files[0][0]) as picture:
         assert picture.size == (1080, 660)  # 150 dpi
 
 
 def results_folder(folder: Path, table: pd.DataFrame) -> Path:
-    with ResultsTable(folder, {"recipe": "made up"}) as results:
-        for (experiment, features, seed, setting), rows in table.groupby(
-            ["experiment", "features", "seed", "setting"]
-        ):
-            metrics = dict(zip(rows["metric"], rows["value"], strict=True))
-            results.append(Trial(experiment, features, int(seed), setting), {**metrics, "seconds": 1.0})
+    folder.mkdir()
+    table.to_csv(folder / ROWS, index=False)
+    write_json(folder / SUMMARY, summary_content({"experiment": "paper", "recipe": "made up"}, {}))
     return folder
 
 
-def test_figures_command(tmp_path, capsys):
+def test_results_are_judged_and_drawn_without_data(tmp_path, capsys):
     table = paper_like(num_seeds=3)
     folder = results_folder(tmp_path / "results", table[table["experiment"] == "support-points"])
-    assert cli.main(["figures", str(folder)]) == 0
+    assert cli.main(["evaluate", "paper", "--out", str(folder)]) == 0
     printed = capsys.readouterr()
-    out = folder / "figures"
-    written = ["figure-9a.png", "figure-9a.svg", "claims.json", "claims.md", "summary.csv"]
-    assert sorted(path.name for path in out.iterdir()) == sorted(written)
-    assert printed.out.splitlines()[-5:] == [str(out / name) for name in written]
-    assert "undecided" in printed.out
-    assert "yes" in printed.out
-    assert printed.err.count("is left out: no rows for it") == 7
-    assert len(json.loads((out / "claims.json").read_text())) == len(CLAIMS)
-    assert cli.main(["figures", str(folder), "--out", str(tmp_path / "elsewhere")]) == 0
-    assert (tmp_path / "elsewhere" / "figure-9a.png").is_file()
+    names = [ROWS, SUMMARY, REPORT, "figure-9a.png", "figure-9a.svg"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(names)
+    assert printed.out.splitlines()[-5:] == [str(folder / name) for name in names]
+    assert "| undecided |" in printed.out
+    assert "| yes |" in printed.out
+    summary = json.loads((folder / SUMMARY).read_text())
+    assert len(summary["claims"]) == len(CLAIMS)
+    assert summary["identity"] == {"experiment": "paper", "recipe": "made up"}
 
 
-def test_figures_command_with_several_folders(tmp_path, capsys):
+def test_further_folders_of_results_are_taken_in(tmp_path):
     table = paper_like(num_seeds=1)
-    parts = {name: table[table["experiment"] == name] for name in ("support-points", "features")}
-    folders = [str(results_folder(tmp_path / name, part)) for name, part in parts.items()]
-    assert cli.main(["figures", *folders]) == 0
-    drawn = {path.name for path in (tmp_path / "support-points" / "figures").iterdir()}
-    assert {"figure-9a.png", "figure-10a.png"} <= drawn
-    assert cli.main(["figures", *folders, folders[0]]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("foretrace: error: support-points, ")
-    assert error.endswith("is in two folders: leave one out")
-
-
-def test_figures_command_without_results(tmp_path, capsys):
-    assert cli.main(["figures", str(tmp_path / "nowhere")]) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith("foretrace: error: ")
-    assert printed.err.count("\n") == 1
-    assert not (tmp_path / "nowhere").exists()
-    folder = results_folder(tmp_path / "results", paper_like(num_seeds=1).iloc[:1])
-    description = json.loads((folder / "results.json").read_text())
-    (folder / "results.json").write_text(json.dumps({**description, "version": 99}))
-    assert cli.main(["figures", str(folder)]) == 2
-    assert "version 99" in capsys.readouterr().err
+    first, second = (
+        results_folder(tmp_path / name, table[table["experiment"] == name])
+        for name in ("support-points", "features")
+    )
+    found = run_experiment(Paper(results=(second,)), first)
+    assert {"figure-9a.png", "figure-10a.png"} <= {file.name for file in found.files}
+    assert set(found.rows["experiment"]) == {"support-points"}
+    with pytest.raises(ResultsError, match=r"support-points, .* is in two folders: leave one out"):
+        run_experiment(Paper(results=(second, first)), first)

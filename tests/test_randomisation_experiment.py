@@ -1,71 +1,48 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
-from foretrace.predictor.context import PARAMETERS
+import torch
 from rich.console import Console
 
 import factories
-from engines_at_hand import WITHOUT_BULLET
 from foretrace.actions import LeverUp, ToolPath
-from foretrace.cli import main
 from foretrace.errors import DatasetError, ResultsError
-from foretrace.evaluation.results import Trial, read_results
+from foretrace.evaluation.run import run_experiment
 from foretrace.experiments import randomisation
 from foretrace.experiments.randomisation import (
+    BARS,
     KNOWING,
     NAMES,
+    NOMINAL,
     PLAIN,
+    TESTS,
     VARIED,
-    RandomisationRecipe,
+    RandomisationExperiment,
     Shown,
     distances,
     open_both,
-    run_randomisation,
     split_both,
 )
-from foretrace.experiments.randomisation_report import (
-    BARS,
-    JUDGES,
-    NOMINAL,
-    markdown,
-    randomisation_figure,
-    summarise,
-)
+from foretrace.experiments.training import Recipe
 from foretrace.experiments.transfer_objects import PENTAGON, Subject
-from foretrace.imagined import ImaginedBatch
-from foretrace.interactions.record import Outcome, Physics
-from foretrace.predictor import TrainConfig
-from foretrace.predictor.base import EffectPredictor
-from foretrace.simulation.collect import CollectConfig, collect, trial
-from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION, Randomisation
+from foretrace.imagined import Futures, ImaginedBatch
+from foretrace.imagined.context import PARAMETERS
+from foretrace.predictor import LstmConfig
+from foretrace.simulation.randomisation import RANDOMISED, VARIED_ACTION, Randomisation
 from foretrace.simulation.stand_in import StandIn
 
 QUIET = Console(quiet=True)
-RECIPE = RandomisationRecipe(TrainConfig(hidden=8, epochs=1, min_steps=1, device="cpu", threads=1), repeats=1)
-
-ACTION = replace(RECIPE, repeats=0, known=tuple(PARAMETERS))
-
-
-def fake_simulate(config: CollectConfig, id: int):
-    """Made-up motions with the constants that would have been drawn; more slip where they vary."""
-    obj, action, seed = trial(config, id)
-    varied = config.randomisation != NOTHING
-    outcome = Outcome.SLIPPED if id % (5 if varied else 13) == 3 else Outcome.LEVERED
-    made = factories.fake_lever_up(obj, action, id=id, seed=seed, num_samples=12, outcome=outcome)
-    _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
-    return replace(made, physics=physics, action=replace(made.action, path=path))
+QUICK = Recipe.of("lstm").change(hidden=8, epochs=1, min_steps=1)
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("randomisation")
-    plain = CollectConfig(8, 1)
-    action = Randomisation(**VARIED_ACTION)
-    for name, drawn in (("plain", NOTHING), ("varied", RANDOMISED), ("action", action)):
-        config = replace(plain, randomisation=drawn)
-        collect(config, root / name, workers=1, console=QUIET, simulate=fake_simulate)
+    factories.fake_data_set(root / "plain")
+    factories.fake_data_set(root / "varied", RANDOMISED)
+    factories.fake_data_set(root / "action", Randomisation(**VARIED_ACTION))
     return root / "plain", root / "varied"
 
 
@@ -82,13 +59,23 @@ def shown() -> list[Shown]:
     return found
 
 
+def compared(folders: tuple[Path, Path], **options) -> RandomisationExperiment:
+    usual = {"features": ("none", "sp-rule"), "repeats": 1, "recipe": QUICK}
+    return RandomisationExperiment(*folders, **usual | options)
+
+
 @pytest.fixture(scope="module")
-def results(folders, shown):
-    out = folders[0].parent / "results"
+def experiment(folders) -> RandomisationExperiment:
+    return compared(folders)
+
+
+@pytest.fixture(scope="module")
+def table(experiment, folders, shown) -> pd.DataFrame:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(randomisation, "_shown_once", lambda stand_in, repeats: shown)
-        assert run_randomisation(*folders, out, ["none", "sp-rule"], [0, 1, 2], RECIPE, console=QUIET) == []
-    return out
+        patch.setattr(randomisation, "play_all", lambda stand_in, repeats: shown)
+        found = run_experiment(experiment, folders[0].parent / "results", console=QUIET)
+    assert found.failures == []
+    return found.rows
 
 
 def test_no_object_is_learned_from_and_tested_in_either_data_set(folders):
@@ -113,8 +100,7 @@ def test_no_object_is_learned_from_and_tested_in_either_data_set(folders):
     assert not np.array_equal(first, other)
 
 
-def test_every_trial_has_its_numbers(results):
-    table = read_results(results)
+def test_every_trial_has_its_numbers(table):
     counts = table.groupby(["features", "setting"])["metric"].nunique()
     assert counts.to_dict() == {
         (label, setting): 12 if setting == KNOWING else 8
@@ -127,42 +113,22 @@ def test_every_trial_has_its_numbers(results):
     assert errors.between(0.01, 100).all()
 
 
-def test_results_are_the_same_again_and_only_what_is_missing_is_done(
-    results, folders, shown, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(randomisation, "_shown_once", lambda stand_in, repeats: shown)
-    again = tmp_path / "again"
-    assert run_randomisation(*folders, again, ["sp-rule"], [1], RECIPE, console=QUIET) == []
-    whole, part = read_results(results), read_results(again)
-    merged = part.merge(whole, on=["experiment", "features", "seed", "setting", "metric"])
-    assert len(merged) == len(part)
-    merged = merged.loc[merged["metric"].ne("seconds")]
-    np.testing.assert_array_equal(merged["value_x"], merged["value_y"])
-
-    def refuse(*arguments):
-        raise AssertionError("trained again")
-
-    monkeypatch.setattr(randomisation, "fit_predictor", refuse)
-    assert run_randomisation(*folders, again, ["sp-rule"], [1], RECIPE, console=QUIET) == []
-    with pytest.raises(ResultsError, match=r"holds results with recipe\.repeats = 1, asked for is 2"):
-        run_randomisation(*folders, again, ["sp-rule"], [1], replace(RECIPE, repeats=2), console=QUIET)
-
-
-def test_who_knows_is_told_the_stand_ins_constants_or_the_usual_ones(shown, monkeypatch):
-    predictor = TrainConfig(features="none", hidden=8, known=NAMES).make_predictor(60)
+def test_the_context_is_the_stand_ins_constants_or_the_nominal_ones(shown, monkeypatch):
+    predictor = LstmConfig(features="none", hidden=8, context=NAMES).make(60)
     seen = []
 
-    def imagine(self, batch, start="observed"):
-        seen.append(batch)
-        return ImaginedBatch(0.05 * np.arange(60), np.array(batch.com))
+    predictor.times.copy_(0.05 * torch.arange(60))
 
-    monkeypatch.setattr(EffectPredictor, "imagine_batch", imagine)
+    def imagine_scenes(self, scenes):
+        seen.append(scenes.source)
+        com = np.repeat(scenes.com[:, None], 60, axis=1)
+        return ImaginedBatch(0.05 * np.arange(60), com, None, Futures.point(com, None, "levered"))
+
+    monkeypatch.setattr(type(predictor), "imagine_scenes", imagine_scenes)
     found = distances(predictor, shown)
     distances(predictor, shown, nominal=True)
     true, nominal = seen
-    np.testing.assert_allclose(
-        true.parameters["friction"], [each.observed.perturbation.friction for each in shown]
-    )
+    np.testing.assert_allclose(true.parameters["friction"], [each.observed.perturbation.friction for each in shown])
     factors = [each.observed.perturbation.density_factor for each in shown]
     np.testing.assert_allclose(true.parameters["density"], 700 * np.array(factors))
     assert nominal.parameters["friction"].tolist() == [0.8] * 3
@@ -178,84 +144,71 @@ def test_who_knows_is_told_the_stand_ins_constants_or_the_usual_ones(shown, monk
 
 def test_data_that_do_not_fit_are_refused(folders, tmp_path):
     plain, varied = folders
-    with pytest.raises(ResultsError, match=r"friction is the same all over .*: simulate it with --randomise"):
-        run_randomisation(plain, plain, tmp_path / "out", console=QUIET)
-    with pytest.raises(ResultsError, match=r"friction varies in .*: simulate the plain data without"):
-        run_randomisation(varied, varied, tmp_path / "out", console=QUIET)
-    with pytest.raises(DatasetError, match="no such folder"):
-        run_randomisation(plain, tmp_path / "nothing", tmp_path / "out", console=QUIET)
+    for pair, kind, message in (
+        ((plain, plain), ResultsError, r"friction is the same all over .*: simulate it with --randomise"),
+        ((varied, varied), ResultsError, r"friction varies in .*: simulate the plain data without"),
+        ((plain, tmp_path / "nothing"), DatasetError, "no such folder"),
+        ((plain, None), ResultsError, "give both --plain and --varied"),
+    ):
+        with pytest.raises(kind, match=message):
+            run_experiment(compared(pair), tmp_path / "out", console=QUIET)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"features": ["sp-truth"]}, "'sp-truth' cannot be had from a view: choose from none"),
-        ({"features": ["magic"]}, "'magic' cannot be had"),
-        ({"seeds": [-1]}, "seed -1 is negative"),
-        ({"workers": 0}, "workers is 0"),
+        ({"features": ("sp-truth",)}, "'sp-truth' cannot be had from a view: choose from none"),
+        ({"features": ("magic",)}, "'magic' cannot be had"),
+        ({"seeds": (-1,)}, "seed -1 is negative"),
+        ({"repeats": -1}, "repeats is -1"),
+        ({"context": ()}, "name what varies, of friction"),
     ],
 )
-def test_impossible_comparisons_are_refused(folders, tmp_path, wrong, message):
+def test_impossible_comparisons_are_refused(folders, wrong, message):
     with pytest.raises(ResultsError, match=message):
-        run_randomisation(*folders, tmp_path, **wrong, console=QUIET)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [({"repeats": -1}, "repeats is -1"), ({"known": ()}, "name what varies, of friction")],
-)
-def test_impossible_recipes_are_refused(wrong, message):
-    with pytest.raises(ResultsError, match=message):
-        RandomisationRecipe(**wrong)
+        compared(folders, **wrong).trials()
 
 
 # --- the action's parameters ----------------------------------------------------------------------------------
 
 
-def test_what_the_default_recipe_says_of_itself_has_not_changed():
-    assert "known" not in RandomisationRecipe().describe()
-    assert ACTION.describe()["known"] == tuple(PARAMETERS)
-
-
-def test_actions_that_vary_are_told_without_a_stand_in(folders, tmp_path, monkeypatch):
+def test_actions_that_vary_are_context_without_a_stand_in(folders, tmp_path, monkeypatch):
     plain, action = folders[0], folders[0].parent / "action"
     told = []
     measure = randomisation.measure_errors
 
     def spy(predictor, batch, inputs):
-        if predictor.known:
-            told.append((predictor.known, batch))
+        if predictor.context:
+            told.append((predictor.context, batch))
         return measure(predictor, batch, inputs)
 
     monkeypatch.setattr(randomisation, "measure_errors", spy)
-    assert run_randomisation(plain, action, tmp_path, ["none"], [0], ACTION, console=QUIET) == []
-    table = read_results(tmp_path)
+    options = {"features": ("none",), "seeds": (0,), "repeats": 0, "context": tuple(PARAMETERS)}
+    varied = compared((plain, action), **options)
+    found = run_experiment(varied, tmp_path, console=QUIET)
+    table = found.rows
     assert not table["metric"].str.contains("stand_in").any()
     assert table.groupby("setting")["metric"].nunique().to_dict() == {PLAIN: 6, VARIED: 6, KNOWING: 8}
-    assert {known for known, _ in told} == {tuple(PARAMETERS)}
+    assert {context for context, _ in told} == {tuple(PARAMETERS)}
     spreads = [np.ptp(batch.parameters["sweep"]) > 0.1 for _, batch in told]
-    assert spreads == [False, False, True, False]  # plain, told the usual, varied, told the usual
+    assert spreads == [False, False, True, False]  # plain, with nominal values, varied, with nominal values
     assert set(told[3][1].parameters["sweep"]) == {ToolPath.sweep}
-    assert list(summarise(table)["none"]) == ["plain test", "randomised test"]
-    assert [label.get_text() for label in randomisation_figure(table).axes[0].get_xticklabels()] == [
-        *("plain test", "randomised test")
-    ]
+    assert list(found.summary["none"]) == ["plain test", "randomised test"]
+    axis = varied.figures(table)["randomisation"].axes[0]
+    assert [label.get_text() for label in axis.get_xticklabels()] == ["plain test", "randomised test"]
     with pytest.raises(
         ResultsError, match=r"insertion is the same all over .*: simulate it with --vary-action"
     ):
-        run_randomisation(*folders, tmp_path / "other", ["none"], [0], ACTION, console=QUIET)
-    with pytest.raises(ResultsError, match=r"holds results with data"):
-        run_randomisation(*folders, tmp_path, ["none"], [0], RECIPE, console=QUIET)
+        run_experiment(compared(folders, **options), tmp_path / "other", console=QUIET)
 
 
 # --- report ---------------------------------------------------------------------------------------------------
 
 
-def test_the_report_has_means_and_differences_within_seeds(results):
-    table = read_results(results)
-    assert set(NOMINAL) == set(JUDGES.values())
-    summary = summarise(table)
+def test_the_report_has_means_and_differences_within_seeds(experiment, table):
+    assert set(NOMINAL) == set(TESTS.values())
+    summary = experiment.summarise(table)
     assert list(summary) == ["none", "sp-rule"]
     found = summary["sp-rule"]["randomised test"]
     assert list(found["errors"]) == list(BARS)
@@ -265,46 +218,26 @@ def test_the_report_has_means_and_differences_within_seeds(results):
     gain = found["differences"]["randomised instead of plain"]
     assert gain["mean"] == pytest.approx(means[VARIED] - means[PLAIN], abs=2e-4)
     assert gain["low"] <= gain["mean"] <= gain["high"]
-    text = markdown(summary)
+    text = experiment.report(summary, table)
     assert text.count("| `none` |") == 8
     assert f"{means[PLAIN]:.3f}" in text
 
 
-def test_the_figure_shows_every_bar_with_its_height(results):
-    table = read_results(results)
-    fig = randomisation_figure(table)
+def test_the_figure_shows_every_bar_with_its_height(experiment, table):
+    fig = experiment.figures(table)["randomisation"]
     heights = sorted(patch.get_height() for patch in fig.axes[0].patches)
     errors = [
-        each["mean"] for judge in summarise(table)["none"].values() for each in judge["errors"].values()
+        each["mean"]
+        for test in experiment.summarise(table)["none"].values()
+        for each in test["errors"].values()
     ]
     np.testing.assert_allclose(heights, sorted(errors), atol=1e-4)
 
 
-def test_an_unfinished_comparison_is_reported_as_far_as_it_is(results):
-    table = read_results(results)
+def test_an_unfinished_comparison_is_reported_as_far_as_it_is(experiment, table):
     some = table.loc[table["setting"].ne(KNOWING) & table["seed"].eq(0)]
-    summary = summarise(some)
+    summary = experiment.summarise(some)
     assert list(summary["none"]["plain test"]["errors"]) == ["plain data", "randomised data"]
     assert summary["none"]["plain test"]["errors"]["plain data"]["low"] is None
-    assert "| `none` | plain test |" in markdown(summary)
-    assert len(randomisation_figure(some).axes) == 2
-
-
-@WITHOUT_BULLET
-def test_the_command_writes_table_summary_and_picture(folders, shown, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(randomisation, "_shown_once", lambda stand_in, repeats: shown)
-    monkeypatch.setattr("foretrace.predictor.RECIPES", {"lstm": TrainConfig(hidden=8, min_steps=1)})
-    out = tmp_path / "out"
-    plain, varied = map(str, folders)
-    options = ["--features", "none", "--seeds", "0", "--epochs", "1", "--repeats", "1"]
-    assert (
-        main(["evaluate", "randomisation", "--plain", plain, "--varied", varied, "--out", str(out), *options])
-        == 0
-    )
-    names = {file.name for file in out.iterdir()} - {".lock"}
-    assert names == {"results.csv", "results.json", "summary.json", "randomisation.md", "randomisation.png"}
-    assert "values known" in capsys.readouterr().out
-    assert Trial("randomisation", "none", 0, KNOWING) in {
-        Trial(*row)
-        for row in read_results(out)[["experiment", "features", "seed", "setting"]].itertuples(index=False)
-    }
+    assert "| `none` | plain test |" in experiment.report(summary, some)
+    assert len(experiment.figures(some)["randomisation"].axes) == 2

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from foretrace.experiments.transfer_recorded import levered_edge
 
 from foretrace.cli import main
 from foretrace.errors import DatasetError
-from foretrace.experiments.transfer_recorded import levered_edge
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.recorded import NOTES_FOLDER, add_recorded, read_notes
 from foretrace.perception.recordings import open_recording

@@ -103,7 +103,7 @@ def test_velocities_are_estimated_from_the_first_frames(tmp_path: Path) -> None:
     recording = one(tmp_path, times=times.tolist(), poses=poses, linear_velocity=None, angular_velocity=None)
     assert recording.velocity is None
     np.testing.assert_allclose(estimate_velocity(recording), velocity, rtol=0.05, atol=0.05)
-    assert replay(recording).summary()["start_velocity"] == "estimated"
+    assert replay(recording).position_error.max() < 0.05
     two = one(tmp_path, times=[0, 0.01], poses=poses[:2], linear_velocity=None, angular_velocity=None)
     assert np.isfinite(estimate_velocity(two)).all()
 
@@ -220,11 +220,12 @@ def test_the_example_is_replayed(engine: str, tmp_path: Path, capsys: pytest.Cap
     out = tmp_path / "replay"
     assert main(["evaluate", "replay", str(EXAMPLE), "--engine", engine, "--out", str(out)]) == 0
     assert "right" in capsys.readouterr().out
-    errors = pd.read_csv(out / "errors.csv")
+    errors = pd.read_csv(out / "rows.csv")
     assert set(errors["recording"]) == {"box tipped over", "cylinder rolled"}
-    assert list(errors.columns) == ["recording", "time", "position_error_m", "rotation_error_deg"]
-    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert summary["engine"] == engine
+    assert list(errors.columns)[:4] == ["recording", "time", "position_error_m", "rotation_error_deg"]
+    content = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert content["identity"]["engine"] == engine
+    summary = content["summary"]
     assert summary["share_right_face"] == 1.0
     box, cylinder = summary["recordings"]
     assert (box["start_velocity"], cylinder["start_velocity"]) == ("recorded", "estimated")

@@ -1,72 +1,64 @@
 import numpy as np
-import pandas as pd
 import pytest
+from scipy import stats
 
-from foretrace.errors import ResultsError
-from foretrace.evaluation.results import COLUMNS
-from foretrace.evaluation.statistics import mean_interval, paired_difference
-
-
-def table(values: dict[str, dict[int, float]]) -> pd.DataFrame:
-    rows = [("e", label, seed, "s", "m", value) for label, by in values.items() for seed, value in by.items()]
-    others = [("e", "a", 0, "s", "other", 99.0), ("e", "a", 0, "t", "m", 99.0), ("f", "a", 0, "s", "m", 99.0)]
-    return pd.DataFrame([*rows, *others], columns=list(COLUMNS))
+from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
+from foretrace.evaluation.tables import markdown_table, mean_with_interval, number
 
 
-def test_the_interval_of_two_values_is_known():
-    # Means of resamples are 0, 1, 2 with shares of a quarter, a half, a quarter.
-    assert mean_interval([0.0, 2.0]) == (1.0, 0.0, 2.0)
-    assert mean_interval([0.0, 2.0], level=0.4) == (1.0, 1.0, 1.0)
-
-
-def test_an_interval_grows_with_level_and_spread_and_moves_with_the_values():
+def test_without_overlap_it_is_the_t_interval():
     values = np.random.default_rng(0).normal(size=10)
-    mean, low, high = mean_interval(values)
-    assert mean == pytest.approx(values.mean())
-    assert low < mean < high
-    _, lower, higher = mean_interval(values, level=0.99)
-    assert lower < low < high < higher
-    np.testing.assert_allclose(mean_interval(3 * values + 1), 3 * np.array([mean, low, high]) + 1)
+    expected = stats.t.interval(0.95, 9, values.mean(), stats.sem(values))
+    found = interval(values, test_to_train=0.0)
+    assert (found.low, found.high) == pytest.approx(expected)
+    assert (found.mean, found.seeds) == (pytest.approx(values.mean()), 10)
 
 
-def test_the_same_seed_gives_the_same_interval():
+def test_overlap_widens_it_as_nadeau_and_bengio_say():
     values = np.random.default_rng(0).normal(size=10)
-    assert mean_interval(values) == mean_interval(values)
-    assert mean_interval(values) != mean_interval(values, seed=1)
+    plain, corrected = interval(values, 0.0), interval(values)
+    wider = (corrected.high - corrected.low) / (plain.high - plain.low)
+    assert wider == pytest.approx(np.sqrt((1 / 10 + 300 / 1400) / (1 / 10)))
+    assert TEST_TO_TRAIN == 300 / 1400
+    assert interval(values, 46.0) == interval(values, 1.0), "the approximation is for small test parts"
+
+
+def test_it_moves_and_grows_with_the_values_and_the_level():
+    values = np.random.default_rng(0).normal(size=10)
+    found, moved, surer = interval(values), interval(3 * values + 1), interval(values, level=0.99)
+    np.testing.assert_allclose(moved[:3], 3 * np.array(found[:3]) + 1)
+    assert surer.low < found.low < found.mean < found.high < surer.high
 
 
 def test_too_few_values_have_no_interval():
-    np.testing.assert_equal(mean_interval([2.0]), (2.0, np.nan, np.nan))
-    np.testing.assert_equal(mean_interval([]), (np.nan, np.nan, np.nan))
+    np.testing.assert_equal(interval([2.0]), (2.0, np.nan, np.nan, 1))
+    np.testing.assert_equal(interval([]), (np.nan, np.nan, np.nan, 0))
+    assert interval([2.0]).as_dict(2) == {"mean": 2.0, "low": None, "high": None}
 
 
-@pytest.mark.parametrize(("n", "lowest", "highest"), [(10, 0.86, 0.94), (50, 0.92, 0.97)])
-def test_intervals_cover_the_true_mean_about_as_often_as_stated(n, lowest, highest):
+@pytest.mark.parametrize("n", [3, 10])
+def test_intervals_cover_the_true_mean_as_often_as_stated(n):
     rng = np.random.default_rng(1)
-    intervals = np.array([mean_interval(rng.normal(size=n), resamples=1000) for _ in range(1000)])
-    share = np.mean((intervals[:, 1] <= 0) & (intervals[:, 2] >= 0))
-    assert lowest < share < highest
+    found = [interval(rng.normal(size=n), 0.0) for _ in range(2000)]
+    assert np.mean([each.low <= 0 <= each.high for each in found]) == pytest.approx(0.95, abs=0.015)
 
 
-def test_pairing_takes_only_seeds_that_both_have_and_cancels_what_they_share():
-    shared = {seed: 100.0 * seed for seed in range(6)}
-    first = {seed: value + 1 for seed, value in shared.items()} | {7: 1e6}
-    second = {**shared, 8: -1e6}
-    found = paired_difference(table({"a": first, "b": second}), "e", "s", "m", "a", "b")
-    assert found == (1.0, 1.0, 1.0, 6)
-    assert paired_difference(table({"a": first, "b": second}), "e", "s", "m", "b", "a").mean == -1.0
+def test_seeds_that_share_objects_are_covered_where_the_plain_interval_is_not():
+    """Means of random test parts of one sample, about the mean of all samples."""
+    rng = np.random.default_rng(2)
+    hits = np.zeros(2)
+    for _ in range(400):
+        sample = rng.normal(size=90)
+        values = [sample[rng.permutation(90)[:15]].mean() for _ in range(10)]
+        for k, ratio in enumerate((0.0, 15 / 75)):
+            found = interval(values, ratio)
+            hits[k] += found.low <= 0 <= found.high
+    assert hits[0] / 400 < 0.85 < 0.9 < hits[1] / 400
 
 
-def test_a_paired_interval_is_that_of_the_differences():
-    rng = np.random.default_rng(0)
-    first, second = rng.normal(size=(2, 10))
-    found = paired_difference(
-        table({"a": dict(enumerate(first)), "b": dict(enumerate(second))}), "e", "s", "m", "a", "b"
-    )
-    assert found[:3] == mean_interval(first - second)
-    assert found.num_seeds == 10
-
-
-def test_nothing_in_common_is_an_error():
-    with pytest.raises(ResultsError, match="no seed of e s has m of both a and b"):
-        paired_difference(table({"a": {0: 1.0}, "b": {1: 1.0}}), "e", "s", "m", "a", "b")
+def test_tables():
+    table = markdown_table(["", "a"], [["x", number(1 / 3)], ["y", number(None)]])
+    assert table.splitlines() == ["|  | a |", "| --- | ---: |", "| x | 0.333 |", "| y |  |"]
+    assert mean_with_interval({"mean": 0.5, "low": 0.4, "high": 0.6}, 2, sign="+") == "+0.50 [+0.40, +0.60]"
+    assert mean_with_interval({"mean": 0.5, "low": None, "high": None}) == "0.500"
+    assert mean_with_interval(None, missing="-") == "-"

@@ -7,6 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from foretrace.experiments.uncertainty_report import markdown, summarise
+from foretrace.experiments.uncertainty_scores import constant_deviations, score
 from rich.console import Console
 
 import factories
@@ -15,8 +17,6 @@ from foretrace.errors import DatasetError
 from foretrace.experiments import uncertainty
 from foretrace.experiments import uncertainty_metrics as metrics
 from foretrace.experiments.uncertainty_metrics import ALL, Part
-from foretrace.experiments.uncertainty_report import markdown, summarise
-from foretrace.experiments.uncertainty_scores import constant_deviations, score
 from foretrace.imagined import LEVELS
 from foretrace.interactions.record import NO_OFFSET, Outcome
 from foretrace.predictor import Futures, ImaginedBatch, load_predictor

@@ -1,4 +1,4 @@
-"""Draws docs/images/data-curve.png: the error of whole motions against how many lever-ups were learned from."""
+"""Draws docs/images/data-curve.png: the error of the direct predictor against the number of training interactions."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import matplotlib as mpl
 import pandas as pd
 from matplotlib.figure import Figure
 
-from foretrace.evaluation.results import read_results
-from foretrace.pictures.scene import INK, STYLE
+from foretrace.evaluation.storage import read_rows
+from foretrace.pictures.style import INK, STYLE
 
 RESULTS = Path(__file__).parents[1] / "results"
 LEVERED = 1814
@@ -19,7 +19,7 @@ GOAL = 0.05
 def rows() -> pd.DataFrame:
     """Rows of one-shot, and of no feature, with the number of interactions learned from."""
     folders = ("paper", "more-data")
-    table = pd.concat([read_results(RESULTS / folder) for folder in folders], ignore_index=True)
+    table = pd.concat([read_rows(RESULTS / folder) for folder in folders], ignore_index=True)
     kept = table["experiment"].isin(["training-size", "more-data"])
     kept |= table["experiment"].eq("features") & table["setting"].eq("shuffled")
     table = table[kept & table["features"].isin(["one-shot", "none"])].copy()

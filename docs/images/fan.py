@@ -20,8 +20,9 @@ from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
 from foretrace.pictures.animation import interaction_animation
-from foretrace.pictures.scene import CM, GREY, INK, STYLE, TOOL_COLOR, silhouette, tool_line
-from foretrace.pictures.tubes import Outlook
+from foretrace.pictures.bands import PredictionBand
+from foretrace.pictures.scene import silhouette, tool_line
+from foretrace.pictures.style import CM, GREY, INK, STYLE, TOOL_COLOR
 from foretrace.predictor import ImaginedEffect, load_predictor, part_of
 from foretrace.trajectories import mean_distance
 
@@ -110,7 +111,7 @@ def draw(ax: Axes, interaction: Interaction, effect: ImaginedEffect) -> None:
         for k in np.flatnonzero(futures.probability[0] >= LEAST_PROBABLE)
         if k != best
     ]
-    Outlook(
+    PredictionBand(
         effect.com_trajectory, radius if np.isfinite(radius).all() else None, LEVEL, others
     ).draw_in_plane(ax, (0, 2), PREDICTED)
     ax.plot(*effect.com_trajectory[:, [0, 2]].T * CM, color=PREDICTED, linewidth=2.0, zorder=5)

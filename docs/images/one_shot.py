@@ -14,7 +14,7 @@ from foretrace.features.outline import fit_hull
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import Prism
-from foretrace.pictures.scene import INK, OBJECT_COLOR, OBJECT_EDGE, STYLE, TOOL_COLOR
+from foretrace.pictures.style import INK, OBJECT_COLOR, OBJECT_EDGE, STYLE, TOOL_COLOR
 from foretrace.predictor.pivot_edges import NUM_VALUES, RIM, find_pivot_edges
 
 CORNERS = np.array(

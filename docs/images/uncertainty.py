@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from foretrace.interactions.record import Outcome
-from foretrace.pictures.scene import GREY, INK, OUTCOME_COLORS, STYLE
+from foretrace.pictures.style import GREY, INK, OUTCOME_COLORS, STYLE
 
 LEVERED, SLIPPED = OUTCOME_COLORS[Outcome.LEVERED], OUTCOME_COLORS[Outcome.SLIPPED]
 SEEN = 12

@@ -1,6 +1,7 @@
 """Classes that register themselves by label, and those that other packages add through entry points."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
@@ -24,7 +25,12 @@ class Registry(Mapping[str, T], Generic[T]):
     def __init__(self, kind: str, group: str, error: type[ForetraceError]):
         self.kind, self.group, self._error = kind, group, error
         self._entries: dict[str, T] = {}
+        self._declared: dict[str, str] = {}
         self._loaded = False
+
+    def declare(self, label: str, module: str) -> None:
+        """Name an entry that a module registers when it is imported; the first look-up of the label imports it."""
+        self._declared[label] = module
 
     def add(self, label: str, entry: T) -> T:
         """Register an entry; returns it.
@@ -53,9 +59,11 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         if label not in self:
             raise self._error(f"unknown {self.kind} {label!r}; available: {', '.join(self)}")
-        return self._entries[label]
+        return self[label]
 
     def __getitem__(self, label: str) -> T:
+        if label not in self._entries and label in self._declared:
+            import_module(self._declared[label])
         if label not in self._entries:
             self._load()
         return self._entries[label]
@@ -63,17 +71,16 @@ class Registry(Mapping[str, T], Generic[T]):
     def __contains__(self, label: object) -> bool:
         if not isinstance(label, str):
             return False
-        if label not in self._entries:
+        if label not in self._entries and label not in self._declared:
             self._load()
-        return label in self._entries
+        return label in self._entries or label in self._declared
 
     def __iter__(self) -> Iterator[str]:
         self._load()
-        return iter(dict(self._entries))
+        return iter(dict.fromkeys((*self._declared, *self._entries)))
 
     def __len__(self) -> int:
-        self._load()
-        return len(self._entries)
+        return len(list(iter(self)))
 
     def _load(self) -> None:
         if self._loaded:

@@ -24,22 +24,12 @@ def _command(home: str, summary: str, section: str = "", varies: bool = False) -
     return Command(summary, f"foretrace.cli.{home}", section, varies)
 
 
-EVALUATIONS: dict[str, Entry] = {
-    "predictor": _command("evaluation:evaluate_predictor", "Errors of one training."),
-    "paper": _command("evaluation:evaluate_paper", "The paper's comparisons and claims."),
-    "reconstruction": _command(
-        "reconstruction:evaluate_reconstruction", "What autoencoders retain of a mask."
-    ),
-    "replay": _command("replay:evaluate_replay", "How far the simulation deviates from recorded motions."),
-    "transfer": _command("transfer:evaluate_transfer", "Errors on other physics, or on recordings."),
-    "non-flat": _command("non_flat:evaluate_non_flat", "What height maps add to masks."),
-    "randomisation": _command(
-        "randomisation:evaluate_randomisation", "What randomised data and known physics add."
-    ),
-    "uncertainty": _command(
-        "uncertainty:evaluate_uncertainty", "Whether probabilities and regions are calibrated."
-    ),
-}
+def _experiments() -> dict[str, Command]:
+    from foretrace.cli.evaluation import experiment_commands
+
+    return experiment_commands()
+
+
 EXPORTS: dict[str, Entry] = {
     "rosbag": _command("export:export_rosbag", "Interactions as bags of ROS 1 or ROS 2."),
     "rerun": _command("export:export_rerun", "Interactions as Rerun recordings."),
@@ -51,7 +41,7 @@ COMMANDS: dict[str, Entry] = {
     "simulate": _command("simulation:simulate", "Simulate lever-ups of many objects into a data set.", LEARN),
     "data": _command("data:data", "Describe, check, repair or upgrade a data set.", LEARN),
     "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
-    "evaluate": Group("Evaluate a predictor, or run an experiment.", EVALUATIONS, LEARN),
+    "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
     "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
     "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
     "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or write its calibration board.", SEE),

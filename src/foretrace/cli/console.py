@@ -16,3 +16,15 @@ def print_outcomes(counts: Mapping[str, int]) -> None:
     for outcome, count in counts.items():
         print(f"{outcome:>10} {count:7d} {100 * count / total:6.1f} %")
     print(f"{'total':>10} {total:7d}")
+
+
+def print_report(text: str) -> None:
+    """A report in Markdown: laid out on a terminal, as it is elsewhere."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    console = Console()
+    if console.is_terminal:
+        console.print(Markdown(text))
+    else:
+        print(text)

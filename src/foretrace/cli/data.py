@@ -71,7 +71,8 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
     """
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import interaction_animation
-    from foretrace.pictures.scene import contact_sheet, interaction_figure
+    from foretrace.pictures.contact_sheet import contact_sheet
+    from foretrace.pictures.scene import interaction_figure
 
     moving, still = (".gif", ".mp4"), (".png", ".svg", ".pdf")
     if out is not None and out.suffix.lower() not in moving + still:

@@ -4,8 +4,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foretrace.cli.evaluation import print_errors
-from foretrace.objects.shape_files import read_silhouette_image
+from foretrace.cli.console import print_report
 
 if TYPE_CHECKING:
     from foretrace.interactions.record import Interaction
@@ -41,11 +40,15 @@ def demo(
         workers: Number of processes that simulate; by default one for each core.
         seed: Seed of everything.
     """
-    from foretrace.evaluation.metrics import evaluate_predictor
+    from rich.console import Console
+
+    from foretrace.evaluation.run import run_experiment
+    from foretrace.experiments.predictor import Predictor
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import scene_animation
-    from foretrace.pictures.scene import comparison_figure, contact_sheet
-    from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, part_of, train_predictor
+    from foretrace.pictures.contact_sheet import contact_sheet
+    from foretrace.pictures.scene import comparison_figure
+    from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
@@ -62,7 +65,7 @@ def demo(
         print(f"2. Training the LSTM with {name}")
         run = train_predictor(dataset, LstmConfig(features=label), out / "runs" / label, config)
         predictors[name] = load_predictor(run)
-        print_errors(evaluate_predictor(predictors[name], part_of(run, dataset)), f"{name}, test part")
+        print_report(run_experiment(Predictor(run, out / "data"), console=Console(quiet=True)).report)
 
     print("3. Predicting shapes and an object that were not in the data, and simulating them")
     shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}
@@ -104,6 +107,7 @@ def _racket() -> "tuple[Interaction, TopDownView]":
     from foretrace.actions import LeverUp
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import Prism
+    from foretrace.objects.shape_files import read_silhouette_image
     from foretrace.simulation.lever_up import simulate_lever_up
 
     mask = read_silhouette_image(Path(__file__).parents[1] / "assets" / "racket.png")

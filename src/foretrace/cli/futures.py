@@ -7,7 +7,7 @@ import numpy as np
 from foretrace.cli.console import say
 
 if TYPE_CHECKING:
-    from foretrace.pictures.tubes import Outlook
+    from foretrace.pictures.bands import PredictionBand
     from foretrace.predictor import Futures, ImaginedEffect
 
 LEVEL = 0.9
@@ -18,17 +18,17 @@ LEAST_PROBABLE = 0.01
 """Futures less probable than this are not drawn."""
 
 
-def outlook_of(imagined: "ImaginedEffect") -> "Outlook":
+def prediction_band(imagined: "ImaginedEffect") -> "PredictionBand":
     """What to draw beside the path."""
-    from foretrace.pictures.tubes import Outlook
+    from foretrace.pictures.bands import PredictionBand
 
     futures, radius = imagined.futures, radius_of(imagined)
     if futures.is_point:
-        return Outlook()
+        return PredictionBand()
     others = [k for k in _in_order(futures)[1:] if futures.probability[0, k] >= LEAST_PROBABLE]
     if radius is not None and radius.max() > LARGEST_RADIUS:
         radius = None
-    return Outlook(
+    return PredictionBand(
         imagined.com_trajectory,
         radius,
         LEVEL,

@@ -33,8 +33,8 @@ class Command:
 
     summary: str
     """What it does, in a line of at most 60 characters."""
-    home: str
-    """Module and function: ``foretrace.cli.data:show``."""
+    home: str | Callable[[], Callable[..., int | None]]
+    """Module and function, as ``foretrace.cli.data:show``; or what makes the function."""
     section: str = ""
     """Heading under which it is listed."""
     varies: bool = False
@@ -42,6 +42,8 @@ class Command:
 
     def load(self, words: Sequence[str]) -> Callable[..., int | None]:
         """The command as a function."""
+        if not isinstance(self.home, str):
+            return self.home()
         module, _, name = self.home.partition(":")
         function = getattr(import_module(module), name)
         return function(words) if self.varies else function

@@ -1,4 +1,4 @@
-"""Questions put to predictors, one function each; the answers are rows, which tables and figures read."""
+"""Errors of predictors."""
 
 from typing import Any
 
@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from foretrace.evaluation.results import Metrics
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.imagined import STARTS, ImaginedBatch
 from foretrace.imagined.context import recorded_context
@@ -19,19 +18,19 @@ METRICS = {"full": mean_distance, "final": final_distance}
 
 
 def evaluate_predictor(predictor: EffectPredictor, batch: InteractionBatch) -> list[dict[str, Any]]:
-    """How far imagined trajectories are from observed ones (paper, section 5.2).
+    """Distances of imagined trajectories from observed ones (paper, section 5.2).
 
-    Trajectories are judged up to where the object slipped off the blade.
+    Trajectories count up to where the object slipped off the blade.
 
     Args:
         predictor: The predictor.
-        batch: The interactions to judge it by.
+        batch: The interactions to evaluate it on.
 
     Returns:
-        Rows with ``group`` (``all``, ``outcome``, ``corners``) and ``value`` (which outcome, how many corners),
-        ``metric`` (``full``: mean distance over the trajectory; ``final``: at its end), ``start`` (``observed``:
-        the first sample was given; ``estimated``: it was guessed from the view), ``count`` of interactions, and
-        the error's ``mean_cm``, ``median_cm``, ``p95_cm``.
+        Rows with ``group`` (``all``, an outcome, or a number of corners such as ``4 corners``), ``metric`` (``full``:
+        mean distance over the trajectory; ``final``: at its end), ``start`` (``observed``: the first sample was given;
+        ``estimated``: from the view), ``count`` of interactions, and the error's ``mean_cm``, ``median_cm``,
+        ``p95_cm``.
     """
     truth = np.where(valid_samples(batch)[..., None], batch.com, np.nan)
     rows = []
@@ -39,8 +38,8 @@ def evaluate_predictor(predictor: EffectPredictor, batch: InteractionBatch) -> l
         imagined = at_times(predictor.imagine_batch(batch, start), batch.times)
         for metric, distance in METRICS.items():
             errors = 100 * np.asarray(distance(imagined, truth))
-            for group, value, chosen in _groups(batch):
-                row = {"group": group, "value": value, "metric": metric, "start": start}
+            for group, chosen in _groups(batch):
+                row = {"group": group, "metric": metric, "start": start}
                 rows.append(row | _summary(errors[chosen]))
     return rows
 
@@ -62,12 +61,12 @@ def pose_errors(
     batch: InteractionBatch,
     valid: Bool[np.ndarray, "batch time"],
 ) -> dict[str, Float[np.ndarray, " batch"]]:
-    """How far imagined poses are from observed ones, averaged over time.
+    """Distances of imagined poses from observed ones, averaged over time.
 
     Args:
         imagined: As ``ImaginedBatch.pose``.
-        batch: What happened.
-        valid: The samples to judge by.
+        batch: The observed interactions.
+        valid: The samples that count.
 
     Returns:
         ``rotation``: geodesic angle [degrees]. ``add``: mean distance of the object's lower and upper corners [cm]
@@ -94,11 +93,11 @@ def pose_errors(
     }
 
 
-def _groups(batch: InteractionBatch) -> list[tuple[str, str, np.ndarray]]:
-    """Name, value and members (batch,) of each group of interactions."""
-    groups = [("all", "", np.ones(len(batch), dtype=bool))]
-    groups += [("outcome", str(outcome), batch.outcome == outcome) for outcome in np.unique(batch.outcome)]
-    groups += [("corners", str(n), batch.num_corners == n) for n in np.unique(batch.num_corners)]
+def _groups(batch: InteractionBatch) -> list[tuple[str, np.ndarray]]:
+    """Name and members (batch,) of each group of interactions."""
+    groups = [("all", np.ones(len(batch), dtype=bool))]
+    groups += [(str(outcome), batch.outcome == outcome) for outcome in np.unique(batch.outcome)]
+    groups += [(f"{n} corners", batch.num_corners == n) for n in np.unique(batch.num_corners)]
     return groups
 
 
@@ -112,12 +111,12 @@ def _summary(errors: np.ndarray) -> dict[str, float | int]:
 
 def measure_errors(
     predictor: EffectPredictor, batch: InteractionBatch, inputs: Shaped[Tensor, "batch ..."]
-) -> Metrics:
+) -> dict[str, float]:
     """Errors of trajectories imagined from the observed first sample (paper, section 5.2), in cm.
 
     Args:
         predictor: The predictor.
-        batch: What it is judged by.
+        batch: What it is evaluated on.
         inputs: The inputs of its features for that.
 
     Returns:

@@ -1,1 +1,5 @@
-"""Experiments: one file a question; each plans trials, runs one, and reads tables and figures off the rows."""
+"""One module for each question; it registers an `Experiment`, and is imported when that is looked up."""
+
+from foretrace.evaluation.experiment import EXPERIMENTS, SUMMARIES
+
+__all__ = ["EXPERIMENTS", "SUMMARIES"]

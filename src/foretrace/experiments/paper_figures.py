@@ -4,7 +4,6 @@ A figure draws whatever rows there are, says how many seeds are behind it, and i
 """
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -13,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from foretrace.experiments.charts import (
+from foretrace.evaluation.charts import (
     GRID,
-    LOOKS,
     draw_boxes,
     draw_line,
     finish,
@@ -27,8 +25,9 @@ from foretrace.experiments.charts import (
     reference,
     rows_of,
     seeds_in_words,
+    style_of,
 )
-from foretrace.experiments.claims import (
+from foretrace.experiments.paper_claims import (
     AUTOENCODERS,
     PAIRS,
     SHAPE_CONTEXTS,
@@ -36,7 +35,8 @@ from foretrace.experiments.claims import (
     SUPERVISED,
     TASK_SPECIFIC,
 )
-from foretrace.pictures.scene import DPI, INK, STYLE
+from foretrace.experiments.paper_comparisons import COMPARISONS
+from foretrace.pictures.style import DPI, INK, STYLE
 
 PANELS = {
     "Shape context": SHAPE_CONTEXTS,
@@ -68,14 +68,14 @@ def figure_9a(table: pd.DataFrame) -> Figure | None:
     fig = Figure(figsize=(7.2, 4.4), dpi=DPI, layout="constrained")
     ax = fig.add_subplot()
     grid(ax, ylim=(0, 103), xlim=(0, 103), xlabel="training interactions used [%]", ylabel="accuracy [%]")
-    ends = {"paper: 93 %": PAPER_ACCURACY}
+    ends = {}
     for name in present(rows):
-        numbers = intervals(rows, name, settings, scale=100.0)
-        draw_line(ax, x, numbers, LOOKS[name])
+        numbers = intervals(rows, name, settings, 100.0, COMPARISONS["support-points"].ratio)
+        draw_line(ax, x, numbers, style_of(name))
         ends[name] = last(numbers)
     reference(ax, PAPER_ACCURACY)
-    label_ends(ax, ends)
-    finish(fig, "Support points named right", f"means and 95 % intervals over {seeds_in_words(rows)}")
+    label_ends(ax, ends, {"paper: 93 %": PAPER_ACCURACY})
+    finish(fig, "Support points predicted correctly", f"means and 95 % intervals over {seeds_in_words(rows)}")
     return fig
 
 
@@ -91,9 +91,9 @@ def figure_9b(table: pd.DataFrame) -> Figure | None:
     names = present(rows)
     draw_groups(ax, rows, names, scale=100.0)
     reference(ax, PAPER_NOVEL_ACCURACY)
-    label_ends(ax, {"paper: 89 %": PAPER_NOVEL_ACCURACY})
+    label_ends(ax, {}, {"paper: 89 %": PAPER_NOVEL_ACCURACY})
     legend(fig, names, lines=False)
-    finish(fig, "Support points named right, novel corner counts",
+    finish(fig, "Support points predicted correctly, novel corner counts",
            f"means and 95 % intervals over {seeds_in_words(rows)}")  # fmt: skip
     return fig
 
@@ -104,8 +104,8 @@ def draw_groups(ax: Axes, rows: pd.DataFrame, names: Sequence[str], scale: float
     if len(names) <= 3:
         offsets = offsets * 0.6
     for name, offset in zip(names, offsets, strict=True):
-        numbers = intervals(rows, name, PAIRS, scale)
-        draw_line(ax, [float(k + offset) for k in range(len(PAIRS))], numbers, LOOKS[name], line=False)
+        numbers = intervals(rows, name, PAIRS, scale, COMPARISONS["novel-corners"].ratio)
+        draw_line(ax, [float(k + offset) for k in range(len(PAIRS))], numbers, style_of(name), line=False)
     for k in range(len(PAIRS) - 1):
         ax.axvline(k + 0.5, color=GRID, linewidth=0.8)
     ax.set(xticks=range(len(PAIRS)), xticklabels=[pair.replace("&", " and ") for pair in PAIRS])
@@ -158,10 +158,16 @@ def figure_10_by_object(table: pd.DataFrame) -> Figure | None:
     return fig
 
 
-def draw_panels(fig: Figure, rows: pd.DataFrame, settings: Sequence[str], x: Sequence[float]) -> list[Axes]:
+def draw_panels(
+    fig: Figure, rows: pd.DataFrame, experiment: str, settings: Sequence[str], x: Sequence[float]
+) -> list[Axes]:
     """Curves of all predictors, a panel for each family; the others are behind them in grey."""
-    numbers = {name: intervals(rows, name, settings) for name in present(rows)}
+    ratio = COMPARISONS[experiment].ratio
+    numbers = {name: intervals(rows, name, settings, ratio=ratio) for name in present(rows)}
     panels = {title: [name for name in names if name in numbers] for title, names in PANELS.items()}
+    panels["Others"] = [
+        name for name in numbers if name != "none" and not any(name in p for p in PANELS.values())
+    ]
     panels = {title: names for title, names in panels.items() if names} or {"No feature": []}
     axes = fig.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     top = 1.06 * max(np.nanmax(part) for part in numbers.values())
@@ -173,7 +179,7 @@ def draw_panels(fig: Figure, rows: pd.DataFrame, settings: Sequence[str], x: Seq
                 ax.plot(np.asarray(x)[known], values[known, 0], color=BACKGROUND, linewidth=1, zorder=1)
         grid(ax, ylim=(0, top), title=title)
         for name in shown:
-            draw_line(ax, x, numbers[name], LOOKS[name])
+            draw_line(ax, x, numbers[name], style_of(name))
         label_ends(ax, {name: last(numbers[name]) for name in shown})
     axes[0].set_ylabel(ERRORS["full"])
     return list(axes)
@@ -186,7 +192,7 @@ def figure_11(table: pd.DataFrame) -> Figure | None:
     if rows.empty:
         return None
     fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
-    for ax in draw_panels(fig, rows, SIZES, [float(size) for size in SIZES]):
+    for ax in draw_panels(fig, rows, "training-size", SIZES, [float(size) for size in SIZES]):
         ax.set_xscale("log", base=2)
         ax.set_xticks([float(size) for size in SIZES], SIZES)
         ax.minorticks_off()
@@ -206,7 +212,7 @@ def figure_12(table: pd.DataFrame) -> Figure | None:
     pairs = several[["features", "seed"]].drop_duplicates()
     rows = pd.concat([one.merge(pairs), several])
     fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
-    for ax in draw_panels(fig, rows, ("1", *STEPS), [1.0, 2.0, 3.0, 4.0, 5.0]):
+    for ax in draw_panels(fig, rows, "steps-ahead", ("1", *STEPS), [1.0, 2.0, 3.0, 4.0, 5.0]):
         ax.set(xticks=range(1, 6), xlim=(0.7, 5.3), xlabel="states predicted at once, n")
     finish(fig, "Error against the number of states predicted at once",
            f"means and 95 % intervals over {seeds_in_words(rows)}; grey: the other families")  # fmt: skip
@@ -250,28 +256,3 @@ FIGURES: dict[str, Callable[[pd.DataFrame], Figure | None]] = {
     "figure-13": figure_13,
 }
 """Every figure by the name of its files."""
-
-
-def write_figures(table: pd.DataFrame, out: Path, report: Callable[[str], None] = print) -> list[Path]:
-    """Draw every figure as PNG and SVG; the same table gives the same bytes.
-
-    Args:
-        table: Columns experiment, features, seed, setting, metric, value.
-        out: Folder to write to.
-        report: Takes a line for each figure that there are no rows for.
-
-    Returns:
-        The files written.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with mpl.rc_context({"svg.hashsalt": "foretrace"}):
-        for name, draw in FIGURES.items():
-            fig = draw(table)
-            if fig is None:
-                report(f"{name} is left out: no rows for it")
-                continue
-            for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None, "Creator": None})):
-                paths.append(out / f"{name}.{suffix}")
-                fig.savefig(paths[-1], metadata=metadata)
-    return paths

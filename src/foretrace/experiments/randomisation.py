@@ -1,87 +1,96 @@
 """What randomised training data do for transfer, and what it helps to know what was drawn (paper, section 6).
 
 Three predictors per seed are trained on equally many interactions: of the plain data, of the randomised data, and of
-the randomised data with what varies known: friction and density, or the action's parameters. All are judged by plain
-and by randomised test interactions and, if wanted, by the stand-in for the real robot, which is another engine with
-other constants and with senses that err.
+the randomised data conditioned on what varies: friction and density, or the action's parameters. All are evaluated on
+plain and on randomised test interactions and, if wanted, against the stand-in for the real robot, which is another
+engine with other constants and with senses that err.
 
 Objects are split, not interactions: no object of a test part was learned from, in either data set.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
-from rich.console import Console
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from torch import Tensor
+from tyro.conf import Fixed, Suppress
 
 from foretrace.errors import ResultsError
+from foretrace.evaluation.charts import BLUE, GREEN, ORANGE, finish, grid, seeds_in_words
+from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds
 from foretrace.evaluation.metrics import measure_errors
-from foretrace.evaluation.results import Metrics, ResultsTable, Trial, describe_machine
-from foretrace.evaluation.runner import Failure, run_trials
-from foretrace.experiments.paper_protocol import Recipe, load_levered
+from foretrace.evaluation.statistics import interval
+from foretrace.evaluation.tables import markdown_table, mean_with_interval
+from foretrace.experiments import SUMMARIES
+from foretrace.experiments.training import BASE, Recipe, load_levered
 from foretrace.experiments.transfer import distance_until_slip
 from foretrace.experiments.transfer_objects import Subject, everyday_objects, play, printed_shapes
-from foretrace.features import FEATURES, make_features
+from foretrace.features import FEATURES
+from foretrace.imagined.context import CONSTANTS, CONTEXT, check_names, column_of, true_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
-from foretrace.predictor import EffectPredictor, TrainConfig
-from foretrace.predictor.context import CONSTANTS, KNOWN, check_names, true_values
+from foretrace.pictures.style import DPI, GREY, INK, STYLE
+from foretrace.predictor import EffectPredictor
 from foretrace.predictor.run_folder import fingerprint
-from foretrace.predictor.runtime import thread_count
-from foretrace.predictor.training import fit_predictor
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 
-EXPERIMENT = "randomisation"
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"
 SETTINGS = (PLAIN, VARIED, KNOWING)
-"""What is learned from: plain data; randomised data; the same, with what varies known."""
+"""What is learned from: plain data; randomised data; the same, conditioned on what varies."""
 NAMES = tuple(CONSTANTS)
-"""What is known by default."""
+"""What predictors are conditioned on by default."""
 GROUPS = ("printed", "everyday")
 """Objects of the stand-in."""
-
-
-@dataclass(frozen=True)
-class RandomisationRecipe:
-    """What decides the results beside the data and a trial itself."""
-
-    training: TrainConfig = field(default_factory=TrainConfig)
-    """Settings of all trainings; features, known constants and seed are the trial's."""
-    stand_in: StandIn = field(default_factory=StandIn)
-    """What stands in for the real robot."""
-    repeats: int = 3
-    """Lever-ups by the stand-in at every contact; with 0 it judges nothing."""
-    known: tuple[str, ...] = NAMES
-    """What varies, and is known to the predictors that are told."""
-
-    def __post_init__(self) -> None:
-        check_names(self.known)
-        if not self.known:
-            raise ResultsError(f"nothing is known to anybody: name what varies, of {', '.join(KNOWN)}")
-        if self.repeats < 0:
-            raise ResultsError(
-                f"repeats is {self.repeats}, it must not be negative: 0 leaves out the stand-in"
-            )
-
-    def describe(self) -> dict[str, Any]:
-        """As JSON-able settings."""
-        training = Recipe(self.training).describe()
-        described = {"training": training, "stand_in": asdict(self.stand_in), "repeats": self.repeats}
-        return described if self.known == NAMES else described | {"known": self.known}
+FEATURES_OF_BASE = ("sp-rule", "sc-800", "im-cnn")
+"""Features that the paper's predictor is compared with by default; other predictors have their own."""
+TESTS = {
+    "plain test": "plain_full",
+    "randomised test": "randomised_full",
+    "stand-in, printed": "stand_in_printed",
+    "stand-in, everyday": "stand_in_everyday",
+}
+"""What predictors are evaluated on, and the metric [cm]."""
+NOMINAL = {
+    "plain_full": "plain_nominal_full",
+    "randomised_full": "randomised_nominal_full",
+    "stand_in_printed": "stand_in_printed_nominal",
+    "stand_in_everyday": "stand_in_everyday_nominal",
+}
+"""The same where a predictor that knows what varies is told the nominal values."""
+BARS = {
+    "plain data": (PLAIN, False, GREY, ""),
+    "randomised data": (VARIED, False, ORANGE, ""),
+    "randomised, true values known": (KNOWING, False, BLUE, ""),
+    "randomised, told the nominal values": (KNOWING, True, GREEN, "///"),
+}
+"""Predictors: what they learned from, whether they are told the nominal values, and how they are drawn."""
+CONTRASTS = {
+    "randomised instead of plain": ("randomised data", "plain data"),
+    "true values known": ("randomised, true values known", "randomised data"),
+    "nominal values instead of true ones": (
+        "randomised, told the nominal values",
+        "randomised, true values known",
+    ),
+}
+"""Differences of two predictors of the same seed: the first less the second."""
 
 
 class Both(NamedTuple):
     """The levered interactions of both data sets."""
 
     plain: InteractionBatch
-    """As told."""
+    """With nominal constants and actions."""
     varied: InteractionBatch
     """Randomised."""
 
@@ -97,7 +106,7 @@ def open_both(plain: str | Path, varied: str | Path, names: Sequence[str] = NAME
     """Read both data sets.
 
     Args:
-        plain: Folder of the data as told.
+        plain: Folder of the plain data.
         varied: Folder of the randomised data.
         names: What must vary in the second only.
 
@@ -108,7 +117,7 @@ def open_both(plain: str | Path, varied: str | Path, names: Sequence[str] = NAME
     both = Both(load_levered(plain), load_levered(varied))
     for name in names:
         remedy = "--randomise" if name in CONSTANTS else "--vary-action"
-        spans = [np.ptp(batch.parameters[name]) if len(batch) else 0.0 for batch in both]
+        spans = [np.ptp(column_of(batch, name)) if len(batch) else 0.0 for batch in both]
         if spans[0] > 0:
             raise ResultsError(f"{name} varies in {plain}: simulate the plain data without {remedy}")
         if spans[1] == 0:
@@ -143,66 +152,211 @@ def split_both(both: Both, seed: int) -> tuple[Split, Split]:
 
 
 @dataclass(frozen=True)
-class RandomisationWork:
-    """Carries out a trial, in whatever process it finds itself."""
+class RandomisationTrial(Trial):
+    """One training, and all that it is evaluated on."""
 
-    plain: str
-    """Folder of the plain data."""
-    varied: str
-    """Folder of the randomised data."""
-    recipe: RandomisationRecipe
-    """What all trials have in common."""
+    features: str
+    """What the predictor is told about an object."""
+    seed: int
+    """Seed of the split and of the training."""
+    setting: str
+    """One of SETTINGS."""
 
-    def __call__(self, trial: Trial) -> Metrics:
+
+@dataclass(frozen=True)
+class RandomisationExperiment(Experiment):
+    """What randomised training data do for transfer, and what it helps to know what was drawn.
+
+    Predictors learn from plain data, from randomised data, and from those conditioned on friction, tool friction and
+    density, or on what else varies: the action's parameters. All are evaluated on plain and randomised interactions
+    with objects that none of them has learned from, and against the stand-in of `evaluate transfer`.
+    """
+
+    plain: Path | None = None
+    """Folder of the plain data set. Without data nothing is trained: results that are there are drawn again."""
+    varied: Path | None = None
+    """Folder of a data set that was simulated with --randomise or --vary-action."""
+    features: tuple[str, ...] = ()
+    """What the predictors are told about an object; by default sp-rule, sc-800 and im-cnn for lstm, and its own
+    features for another predictor."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of splits and trainings."""
+    repeats: int = 3
+    """Lever-ups by the stand-in at every contact; 0 leaves it out. It levers with the nominal action."""
+    context: tuple[str, ...] = NAMES
+    """What varies, and is told to some of the predictors: as in `foretrace train`."""
+    predictor: str = BASE
+    """Kind of predictor: lstm or one-shot."""
+    epochs: int | None = None
+    """Passes over the training part, as in `foretrace train`."""
+    recipe: Suppress[Fixed[Recipe | None]] = None
+    """Other settings of the trainings than those of the predictor."""
+    stand_in: Suppress[Fixed[StandIn]] = field(default_factory=StandIn)
+    """What stands in for the real robot."""
+
+    label = "randomisation"
+    summary = SUMMARIES["randomisation"]
+    trial = RandomisationTrial
+
+    def __post_init__(self) -> None:
+        check_names(self.context)
+        if not self.context:
+            raise ResultsError(f"no varying quantity is named: name what varies, of {', '.join(CONTEXT)}")
+        if self.repeats < 0:
+            raise ResultsError(
+                f"repeats is {self.repeats}, it must not be negative: 0 leaves out the stand-in"
+            )
+
+    def trials(self) -> Sequence[RandomisationTrial]:
+        """Features by features, seed by seed; none without data."""
+        usual = FEATURES_OF_BASE if self.predictor == BASE else (self._recipe.features,)
+        labels = list(dict.fromkeys(self.features or usual))
+        for label in labels:
+            if label not in FEATURES or FEATURES[label].oracle:
+                usable = ", ".join(name for name, kind in FEATURES.items() if not kind.oracle)
+                raise ResultsError(f"features {label!r} cannot be had from a view: choose from {usable}")
+        seeds = checked_seeds(self.seeds)
+        if self.plain is None and self.varied is None:
+            return []
+        return [RandomisationTrial(label, seed, s) for label in labels for seed in seeds for s in SETTINGS]
+
+    def identity(self) -> dict[str, Any] | None:
+        """Both data sets, how predictors are trained, and the stand-in."""
+        if self.plain is None and self.varied is None:
+            return None
+        data = {
+            name: fingerprint(batch, self.context)
+            for name, batch in zip((PLAIN, VARIED), self._both, strict=True)
+        }
+        described = {"training": self._recipe.describe(), "stand_in": asdict(self.stand_in)}
+        described |= {"repeats": self.repeats, "context": list(self.context)}
+        return {"data": data, "recipe": described}
+
+    def run(self, trial: RandomisationTrial, folder: Path) -> Sequence[Row]:
         """Errors over the full trajectory on both test parts, distances from the stand-in [cm], and seconds."""
-        both = _both_once(self.plain, self.varied, self.recipe.known)
-        splits = split_both(both, trial.seed)
+        splits = split_both(self._both, trial.seed)
         source = 0 if trial.setting == PLAIN else 1
-        known = self.recipe.known if trial.setting == KNOWING else ()
-        config = replace(self.recipe.training, features=trial.features, known=known, seed=trial.seed)
-        inputs = _inputs_once(self.plain, self.varied, self.recipe.known, trial.features)
-        with thread_count(config.threads):
-            started = perf_counter()
-            predictor, _ = fit_predictor(both[source], config, splits[source], inputs=inputs[source])
-            seconds = perf_counter() - started
-            found: Metrics = {}
-            for name, batch, all_inputs, split in zip((PLAIN, VARIED), both, inputs, splits, strict=True):
-                test, test_inputs = batch[split.test], all_inputs[split.test]
-                errors = measure_errors(predictor, test, test_inputs)
-                found |= {f"{name}_full": errors["full"], f"{name}_final": errors["final"]}
-                if predictor.known:
-                    errors = measure_errors(predictor, _nominal(test), test_inputs)
-                    found[f"{name}_nominal_full"] = errors["full"]
-            if self.recipe.repeats:
-                found |= self._stand_in_distances(predictor)
-        return found | {"train": len(splits[source].train), "seconds": seconds}
+        context = self.context if trial.setting == KNOWING else ()
+        recipe = self._recipe.change(features=trial.features, context=context, seed=trial.seed)
+        inputs = self._inputs(recipe)
+        started = perf_counter()
+        predictor, _ = recipe.fit(self._both[source], splits[source], inputs[source])
+        seconds = perf_counter() - started
+        found: dict[str, float] = {}
+        for name, batch, all_inputs, split in zip((PLAIN, VARIED), self._both, inputs, splits, strict=True):
+            test, test_inputs = batch[split.test], all_inputs[split.test]
+            errors = measure_errors(predictor, test, test_inputs)
+            found |= {f"{name}_full": errors["full"], f"{name}_final": errors["final"]}
+            if predictor.context:
+                errors = measure_errors(predictor, _nominal(test), test_inputs)
+                found[f"{name}_nominal_full"] = errors["full"]
+        if self.repeats:
+            found |= distances(predictor, self._shown)
+            if predictor.context:
+                nominal = distances(predictor, self._shown, nominal=True)
+                found |= {f"{name}_nominal": value for name, value in nominal.items()}
+        found |= {"train": float(len(splits[source].train)), "seconds": seconds}
+        return [{"metric": name, "value": float(value)} for name, value in found.items()]
 
-    def _stand_in_distances(self, predictor: EffectPredictor) -> Metrics:
-        """Distances from the stand-in [cm], told the true and the usual values."""
-        shown = _shown_once(self.recipe.stand_in, self.recipe.repeats)
-        found = distances(predictor, shown)
-        if predictor.known:
-            told = distances(predictor, shown, nominal=True)
-            found |= {f"{name}_nominal": value for name, value in told.items()}
-        return found
+    def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
+        """By features and test: errors of every predictor [cm], and differences within the same seeds."""
+        summary: dict[str, Any] = {}
+        for features in dict.fromkeys(rows["features"]):
+            summary[features] = {}
+            for test, metric in tests_of(rows).items():
+                values = {bar: values_of(rows, features, bar, metric) for bar in BARS}
+                differences = {
+                    name: (values[first] - values[second]).dropna()
+                    for name, (first, second) in CONTRASTS.items()
+                }
+                summary[features][test] = {
+                    "errors": {name: _interval(each) for name, each in values.items() if len(each)},
+                    "differences": {name: _interval(each) for name, each in differences.items() if len(each)},
+                }
+        return summary
+
+    def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+        """Errors and differences as two tables."""
+        parts = ["# Plain and randomised training data"]
+        for part, columns, sign, words in (
+            ("errors", BARS, "", "Errors in cm, means over the seeds [95 % interval]."),
+            (
+                "differences",
+                CONTRASTS,
+                "+",
+                "Differences in cm within the same seeds; below zero is an improvement.",
+            ),
+        ):
+            lines = [
+                [
+                    f"`{features}`",
+                    test,
+                    *(mean_with_interval(found[part].get(name), sign=sign) for name in columns),
+                ]
+                for features, tests in summary.items()
+                for test, found in tests.items()
+            ]
+            parts += [words, markdown_table(["Features", "Evaluated on", *columns], lines)]
+        return "\n\n".join(parts) + "\n"
+
+    def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
+        """Errors of all predictors."""
+        return {"randomisation": randomisation_figure(rows)}
+
+    @cached_property
+    def _recipe(self) -> Recipe:
+        recipe = Recipe.of(self.predictor) if self.recipe is None else self.recipe
+        return recipe.change(epochs=self.epochs, device="cpu")
+
+    @cached_property
+    def _both(self) -> Both:
+        if self.plain is None or self.varied is None:
+            raise ResultsError("one of the two data sets is missing: give both --plain and --varied")
+        return open_both(self.plain, self.varied, self.context)
+
+    def _inputs(self, recipe: Recipe) -> tuple[Tensor, ...]:
+        """Inputs of features for both data sets, once in each process."""
+        if recipe.features not in self._inputs_by_features:
+            self._inputs_by_features[recipe.features] = tuple(recipe.inputs(batch) for batch in self._both)
+        return self._inputs_by_features[recipe.features]
+
+    @cached_property
+    def _inputs_by_features(self) -> dict[str, tuple[Tensor, ...]]:
+        return {}
+
+    @cached_property
+    def _shown(self) -> list[Shown]:
+        """All lever-ups of the stand-in that have a path; drawn by seed 0, as in `evaluate transfer`."""
+        return play_all(self.stand_in, self.repeats)
 
 
-def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool = False) -> Metrics:
+def play_all(stand_in: StandIn, repeats: int) -> list[Shown]:
+    """Lever-ups of printed and everyday objects by a stand-in that have a path."""
+    return [
+        Shown(subject, observed)
+        for subject in printed_shapes() + everyday_objects()
+        for contact in range(len(subject.actions))
+        for observed in play(subject, contact, stand_in, repeats, seed=0).observed
+        if len(observed.com)
+    ]
+
+
+def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool = False) -> dict[str, float]:
     """Mean distance of imagined paths from those of the stand-in after dynamic time warping [cm].
 
     Args:
         predictor: The predictor; it starts where the marker is seen before the action.
         shown: The stand-in's lever-ups.
-        nominal: Whether a predictor that knows constants is told the usual ones, instead of the stand-in's.
+        nominal: Whether a predictor that is conditioned on constants is told the nominal ones, not the stand-in's.
     """
     views = [hull_of(each.observed.view) if each.subject.hull else each.observed.view for each in shown]
     times = predictor.times.cpu().numpy()
     batch = InteractionBatch.from_views(views, times)
     start: Float[np.ndarray, "batch 3"] = np.array([each.observed.com[0] for each in shown])
     told = [Physics(density=each.subject.density) if nominal else each.observed.physics for each in shown]
-    values = [true_values(physics, tuple(KNOWN)) for physics in told]
-    known = {name: np.array([each[name] for each in values]) for name in KNOWN}
-    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), parameters=known)
+    values = [true_context(physics, tuple(CONTEXT)) for physics in told]
+    context = {name: np.array([each[name] for each in values]) for name in CONTEXT}
+    batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), parameters=context)
     imagined = predictor.imagine_batch(batch).com
     values = np.array(
         [distance_until_slip(each.observed, times, path) for each, path in zip(shown, imagined, strict=True)]
@@ -211,90 +365,66 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     return {f"stand_in_{group}": float(values[groups == group].mean()) for group in GROUPS}
 
 
-def run_randomisation(
-    plain: str | Path,
-    varied: str | Path,
-    out: str | Path,
-    features: Iterable[str] = ("sp-rule", "sc-800", "im-cnn"),
-    seeds: Iterable[int] = (0, 1, 2),
-    recipe: RandomisationRecipe | None = None,
-    *,
-    workers: int = 1,
-    console: Console | None = None,
-) -> list[Failure]:
-    """Carry out the comparison, or what is missing of it; it may be stopped at any time.
-
-    Args:
-        plain: Folder of the data as told.
-        varied: Folder of the randomised data.
-        out: Folder of the results; `foretrace.evaluation.results.read_results` reads it.
-        features: What the predictors know about the object.
-        seeds: Seeds of splits and trainings.
-        recipe: What all trainings have in common.
-        workers: Processes.
-        console: Where progress is reported; standard error by default.
-
-    Returns:
-        The trials that failed.
-
-    Raises:
-        ResultsError: The data do not fit together, features are unknown, or the folder holds other results.
-    """
-    recipe = recipe or RandomisationRecipe()
-    seeds = list(dict.fromkeys(seeds))
-    labels = list(dict.fromkeys(features))
-    for label in labels:
-        if label not in FEATURES or FEATURES[label].oracle:
-            usable = ", ".join(name for name, kind in FEATURES.items() if not kind.oracle)
-            raise ResultsError(f"features {label!r} cannot be had from a view: choose from {usable}")
-    if wrong := [seed for seed in seeds if seed < 0]:
-        raise ResultsError(f"seed {wrong[0]} is negative: choose seeds from 0")
-    if workers < 1:
-        raise ResultsError(f"workers is {workers}, it must be at least 1")
-    both = open_both(plain, varied, recipe.known)
-    identity: Mapping[str, Any] = {
-        "data": {
-            name: fingerprint(batch, recipe.known) for name, batch in zip((PLAIN, VARIED), both, strict=True)
-        },
-        "recipe": recipe.describe(),
-    }
-    trials = [
-        Trial(EXPERIMENT, label, seed, setting) for label in labels for seed in seeds for setting in SETTINGS
-    ]
-    work = RandomisationWork(str(plain), str(varied), recipe)
-    threads = recipe.training.threads or 1
-    with ResultsTable(out, identity, describe_machine(recipe.training.device, workers, threads)) as table:
-        return run_trials(trials, work, table, workers=workers, threads=threads, console=console)
-
-
 def _nominal(batch: InteractionBatch) -> InteractionBatch:
-    """The same interactions as if the usual constants and the usual action were all that is known of them."""
-    usual = true_values(Physics(), tuple(KNOWN))
-    constant = {name: np.full(len(batch), value) for name, value in usual.items()}
+    """The same interactions with the nominal constants and action parameters."""
+    values = true_context(Physics(), tuple(CONTEXT))
+    constant = {name: np.full(len(batch), value) for name, value in values.items()}
     return replace(batch, parameters=batch.parameters | constant)
 
 
-@lru_cache(maxsize=1)
-def _both_once(plain: str, varied: str, names: tuple[str, ...]) -> Both:
-    """`open_both`, once per process."""
-    return open_both(plain, varied, names)
+def values_of(table: pd.DataFrame, features: str, bar: str, metric: str) -> pd.Series:
+    """One number per seed [cm]."""
+    setting, nominal, _, _ = BARS[bar]
+    wanted = NOMINAL[metric] if nominal else metric
+    chosen = table["features"].eq(features) & table["setting"].eq(setting) & table["metric"].eq(wanted)
+    return table.loc[chosen].set_index("seed")["value"].sort_index()
 
 
-@lru_cache(maxsize=4)
-def _inputs_once(plain: str, varied: str, names: tuple[str, ...], label: str) -> tuple[Tensor, Tensor]:
-    """Inputs of features for both data sets, once per process."""
-    extractor = make_features(label)
-    first, second = (extractor.inputs(batch) for batch in _both_once(plain, varied, names))
-    return first, second
+def tests_of(table: pd.DataFrame) -> dict[str, str]:
+    """Those of TESTS that there are: the stand-in can be left out."""
+    metrics = set(table["metric"])
+    return {test: metric for test, metric in TESTS.items() if metric in metrics}
 
 
-@lru_cache(maxsize=1)
-def _shown_once(stand_in: StandIn, repeats: int) -> list[Shown]:
-    """All lever-ups of the stand-in that have a path, once per process; drawn by seed 0, as in `evaluate transfer`."""
-    return [
-        Shown(subject, observed)
-        for subject in printed_shapes() + everyday_objects()
-        for contact in range(len(subject.actions))
-        for observed in play(subject, contact, stand_in, repeats, seed=0).observed
-        if len(observed.com)
+def _interval(values: pd.Series) -> dict[str, Any]:
+    found = interval(values)
+    return {**found.as_dict(4), "seeds": found.seeds}
+
+
+@mpl.rc_context(STYLE)
+def randomisation_figure(table: pd.DataFrame) -> Figure:
+    """Errors of all predictors, a panel for each kind of features."""
+    labels = list(dict.fromkeys(table["features"]))
+    fig = Figure(figsize=(9.6, 1.0 + 2.5 * len(labels)), dpi=DPI, layout="constrained")
+    axes = fig.subplots(len(labels), 1, squeeze=False)[:, 0]
+    for ax, features in zip(axes, labels, strict=True):
+        _draw(ax, table, features)
+    patches = [
+        Patch(facecolor=color, hatch=hatch, edgecolor="white", label=name)
+        for name, (_, _, color, hatch) in BARS.items()
     ]
+    fig.legend(handles=patches, loc="outside lower center", ncols=2, columnspacing=1.4)
+    note = f"bars: means over {seeds_in_words(table)} with 95 % intervals; dots: seeds"
+    finish(fig, "What randomised training data do, and what it helps to know what varies", note)
+    return fig
+
+
+def _draw(ax: Axes, table: pd.DataFrame, features: str) -> None:
+    width = 0.8 / len(BARS)
+    tests = tests_of(table)
+    for place, metric in enumerate(tests.values()):
+        for k, (bar, (_, _, color, hatch)) in enumerate(BARS.items()):
+            values = values_of(table, features, bar, metric).to_numpy(float)
+            if len(values) == 0:
+                continue
+            at = place + (k - (len(BARS) - 1) / 2) * width
+            mean, low, high, _ = interval(values)
+            ax.bar(at, mean, 0.92 * width, color=color, hatch=hatch, edgecolor="white", linewidth=0.5)
+            ax.errorbar(
+                at, mean, np.nan_to_num([[mean - low], [high - mean]]), color=INK, elinewidth=1.1, capsize=2
+            )
+            ax.plot(np.full(len(values), at), values, "o", color=INK, markersize=2.2, alpha=0.7)
+    grid(ax, ylim=(0, None), ylabel="error [cm]")
+    ax.set_xticks(range(len(tests)), list(tests))
+    ax.set_title(features, loc="left")
+    ax.tick_params(axis="x", length=0)

@@ -1,23 +1,140 @@
 """What the autoencoders' codes retain of a mask (paper, section 3.2.2)."""
 
-from collections.abc import Mapping
+import base64
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from tyro.conf import Positional
 
 from foretrace.errors import PredictionError
+from foretrace.evaluation.experiment import Experiment, Row, Trial
+from foretrace.evaluation.tables import markdown_table
+from foretrace.experiments import SUMMARIES
 from foretrace.features.autoencoder import AutoencoderFeatures
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.pictures.scene import DPI, INK, STYLE
-from foretrace.predictor import EffectPredictor
+from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.topdown import VIEW_SIZE
+from foretrace.pictures.style import DPI, INK, STYLE
+from foretrace.predictor import EffectPredictor, load_predictor, part_of
+from foretrace.predictor.run_folder import fingerprint
 
 Masks = Bool[np.ndarray, "batch 128 128"]
 BLANK, KEPT, LOST, ADDED = "#f2f4f7", "#7f8fa6", "#d55e00", "#0072b2"
+
+
+@dataclass(frozen=True)
+class CodeTrial(Trial):
+    """One autoencoder."""
+
+    training: str
+    """Folder of the training."""
+
+
+@dataclass(frozen=True)
+class Reconstruction(Experiment):
+    """Masks as the codes of autoencoders retain them, on the test part."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of trainings with features ae-256 or ae-512, of the same split."""
+    data: Path
+    """Folder of the data set that they were trained on."""
+    columns: int = 8
+    """Masks in the picture, at equal steps through the test part."""
+
+    label = "reconstruction"
+    summary = SUMMARIES["reconstruction"]
+    trial = CodeTrial
+    needs_folder = False
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise PredictionError("no training given: name the folders of trainings with ae-256 or ae-512")
+        if self.columns < 1:
+            raise PredictionError(f"--columns is {self.columns}: show at least one mask")
+
+    def trials(self) -> Sequence[CodeTrial]:
+        """One for each training."""
+        return [CodeTrial(str(run)) for run in self.runs]
+
+    def identity(self) -> dict[str, Any]:
+        """The test part."""
+        return {"test": fingerprint(self._test)}
+
+    def run(self, trial: CodeTrial, folder: Path) -> Sequence[Row]:
+        """For each mask its overlap with what the code retains of it, and both as text."""
+        predictor, batch = load_predictor(Path(trial.training)), self._test
+        made = reconstruct_masks(predictor, batch)
+        return [
+            {"features": predictor.features.label, "id": int(id), "iou": float(iou)}
+            | {"mask": pack_mask(mask), "restored": pack_mask(restored)}
+            for id, iou, mask, restored in zip(
+                batch.ids, overlap(batch.mask, made), batch.mask, made, strict=True
+            )
+        ]
+
+    def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
+        """By training: features, and the mean and the worst overlap (intersection over union)."""
+        return {
+            str(name): {
+                "features": part["features"].iloc[0],
+                "iou_mean": round(float(np.mean(part["iou"].to_numpy(float))), 4),
+            }
+            | {"iou_worst": round(float(np.min(part["iou"].to_numpy(float))), 4), "masks": len(part)}
+            for name, part in rows.groupby("training", sort=False)
+        }
+
+    def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+        """A table of the overlaps."""
+        lines = [
+            [f"`{name}`", f["features"], str(f["masks"]), f"{f['iou_mean']:.4f}", f"{f['iou_worst']:.4f}"]
+            for name, f in summary.items()
+        ]
+        head = ["Training", "Features", "Test masks", "IoU, mean", "IoU, worst"]
+        return f"# Masks as autoencoders retain them\n\n{markdown_table(head, lines)}\n"
+
+    def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
+        """Some masks above what each code made of them."""
+        masks, restored = None, {}
+        for name, part in rows.groupby("training", sort=False):
+            shown = np.linspace(0, len(part) - 1, min(self.columns, len(part))).round().astype(int)
+            label = part["features"].iloc[0]
+            masks, made = (
+                np.stack([unpack_mask(part[c].iloc[k]) for k in shown]) for c in ("mask", "restored")
+            )
+            restored[label if label not in restored else str(name)] = made
+        return {} if masks is None else {"reconstruction": reconstruction_figure(masks, restored)}
+
+    @cached_property
+    def _test(self) -> InteractionBatch:
+        dataset = Dataset.open(self.data)
+        parts = [part_of(run, dataset) for run in self.runs]
+        if any(not np.array_equal(part.ids, parts[0].ids) for part in parts):
+            raise PredictionError(
+                "the trainings have different test parts: give trainings of the same split and seed"
+            )
+        return parts[0]
+
+
+def pack_mask(mask: Bool[np.ndarray, "128 128"]) -> str:
+    """A mask as a short text."""
+    return "mask:" + base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode()
+
+
+def unpack_mask(text: str) -> Bool[np.ndarray, "128 128"]:
+    """The mask that `pack_mask` has made a text of."""
+    bits = np.frombuffer(zlib.decompress(base64.b64decode(text.removeprefix("mask:"))), dtype=np.uint8)
+    return np.unpackbits(bits)[: VIEW_SIZE**2].reshape(VIEW_SIZE, VIEW_SIZE).astype(bool)
 
 
 def reconstruct_masks(predictor: EffectPredictor, batch: InteractionBatch) -> Masks:

@@ -1,14 +1,28 @@
 """How far a simulated motion strays from a recorded one that started in the same way."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
 
+import matplotlib as mpl
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
+from tyro.conf import Positional
 
+from foretrace.errors import DatasetError
+from foretrace.evaluation.charts import finish, grid, style_of
+from foretrace.evaluation.experiment import Experiment, Row, Trial
+from foretrace.evaluation.tables import markdown_table
+from foretrace.experiments import SUMMARIES
+from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix, rotation_angle
-from foretrace.interactions.motions import Recording
+from foretrace.interactions.motions import Recording, read_recordings
+from foretrace.pictures.style import DPI, STYLE
 from foretrace.simulation.free_motion import simulate_free_motion
 
 FACE_TOLERANCE = np.deg2rad(20.0)
@@ -17,6 +31,135 @@ ESTIMATE_TIME = 0.1
 """Velocities that are not recorded are estimated from the frames of this time [s], from at least three."""
 TIMESTEP = 0.001
 """Time step of the simulation [s]."""
+
+
+@dataclass(frozen=True)
+class RecordingTrial(Trial):
+    """One recorded motion."""
+
+    recording: str
+    """Its name."""
+
+
+@dataclass(frozen=True)
+class ReplayExperiment(Experiment):
+    """Simulate recorded motions of rigid bodies from their first frame, and measure how far the simulation strays."""
+
+    recordings: Positional[tuple[Path, ...]]
+    """Files of recordings."""
+    engine: Literal["mujoco", "bullet"] = "mujoco"
+    """Physics engine."""
+    timestep: float = TIMESTEP
+    """Time step in seconds."""
+
+    label = "replay"
+    summary = SUMMARIES["replay"]
+    trial = RecordingTrial
+    needs_folder = False
+
+    def __post_init__(self) -> None:
+        if not self.recordings:
+            raise DatasetError("no recording is given: name at least one file")
+
+    def trials(self) -> Sequence[RecordingTrial]:
+        """One for each recording."""
+        return [RecordingTrial(name) for name in self._read]
+
+    def identity(self) -> dict[str, Any]:
+        """The files, engine and time step."""
+        files = [short_hash(file.read_bytes()) for file in self.recordings]
+        return {"recordings": files, "engine": self.engine, "timestep_s": self.timestep}
+
+    def run(self, trial: RecordingTrial, folder: Path) -> Sequence[Row]:
+        """The errors over time, and what is the same in all rows of a recording."""
+        found = replay(self._read[trial.recording], self.engine, self.timestep)
+        start = "estimated" if found.recording.velocity is None else "recorded"
+        same = {"start_velocity": start, "down_error_deg": float(np.rad2deg(found.down_error))}
+        times, turned = found.recording.times, np.rad2deg(found.rotation_error)
+        return [
+            {
+                "time": float(time),
+                "position_error_m": float(position),
+                "rotation_error_deg": float(rotation),
+                **same,
+            }
+            for time, position, rotation in zip(times, found.position_error, turned, strict=True)
+        ]
+
+    def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
+        """The errors of each recording in a few numbers, and the share of those that end on the recorded side."""
+        recordings = []
+        for name, part in rows.groupby("recording", sort=False):
+            position, turned, down = (
+                part[column].to_numpy(float)
+                for column in ("position_error_m", "rotation_error_deg", "down_error_deg")
+            )
+            recordings.append(
+                {
+                    "recording": name,
+                    "duration_s": float(part["time"].iloc[-1]),
+                    "frames": len(part),
+                    "start_velocity": part["start_velocity"].iloc[0],
+                    "mean_position_error_m": float(position.mean()),
+                    "largest_position_error_m": float(position.max()),
+                    "final_position_error_m": float(position[-1]),
+                    "mean_rotation_error_deg": float(turned.mean()),
+                    "final_rotation_error_deg": float(turned[-1]),
+                    "down_error_deg": float(down[0]),
+                    "right_face": bool(down[0] < np.rad2deg(FACE_TOLERANCE)),
+                }
+            )
+        share = sum(each["right_face"] for each in recordings) / len(recordings)
+        return {"share_right_face": share, "recordings": recordings}
+
+    def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+        """A line for each recording."""
+        head = [
+            "Recording",
+            "Time [s]",
+            "Position error, mean [cm]",
+            "Final [cm]",
+            "Rotation error, mean [°]",
+        ]
+        head += ["Final [°]", "Side down at the end"]
+        lines = [
+            [
+                each["recording"],
+                f"{each['duration_s']:.2f}",
+                f"{100 * each['mean_position_error_m']:.2f}",
+                f"{100 * each['final_position_error_m']:.2f}",
+                f"{each['mean_rotation_error_deg']:.1f}",
+                f"{each['final_rotation_error_deg']:.1f}",
+                "right" if each["right_face"] else "wrong",
+            ]
+            for each in summary["recordings"]
+        ]
+        return f"# Recorded against simulated motions in {self.engine}\n\n{markdown_table(head, lines)}\n"
+
+    def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
+        """Errors of position and rotation over time."""
+        with mpl.rc_context(STYLE):
+            fig = Figure(figsize=(9.6, 4.2), dpi=DPI, layout="constrained")
+            axes = fig.subplots(1, 2)
+            for name, part in rows.groupby("recording", sort=False):
+                style = style_of(str(name))
+                drawn = {"color": style.color, "linestyle": style.line}
+                axes[0].plot(part["time"], 100 * part["position_error_m"], label=str(name), **drawn)
+                axes[1].plot(part["time"], part["rotation_error_deg"], **drawn)
+            grid(axes[0], xlabel="time [s]", ylabel="position error [cm]", ylim=(0, None))
+            grid(axes[1], xlabel="time [s]", ylabel="rotation error [°]", ylim=(0, None))
+            fig.legend(loc="outside lower center", ncols=4)
+            finish(
+                fig, "Simulated against recorded motions", f"both start from the first frame; {self.engine}"
+            )
+        return {"errors": fig}
+
+    @cached_property
+    def _read(self) -> dict[str, Recording]:
+        found = [recording for file in self.recordings for recording in read_recordings(file)]
+        if len({recording.name for recording in found}) < len(found):
+            raise DatasetError("two recordings have the same name: give every one its own")
+        return {recording.name: recording for recording in found}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,37 +181,6 @@ class Replay:
     def right_face(self) -> bool:
         """Whether the simulated object ends on the recorded side."""
         return bool(self.down_error < FACE_TOLERANCE)
-
-    def rows(self) -> list[dict[str, Any]]:
-        """The errors over time, one row per frame."""
-        return [
-            {
-                "recording": self.recording.name,
-                "time": float(time),
-                "position_error_m": float(position),
-                "rotation_error_deg": float(np.rad2deg(rotation)),
-            }
-            for time, position, rotation in zip(
-                self.recording.times, self.position_error, self.rotation_error, strict=True
-            )
-        ]
-
-    def summary(self) -> dict[str, Any]:
-        """The errors in a few figures."""
-        degrees = np.rad2deg(self.rotation_error)
-        return {
-            "recording": self.recording.name,
-            "duration_s": float(self.recording.times[-1]),
-            "frames": len(self.recording.times),
-            "start_velocity": "estimated" if self.recording.velocity is None else "recorded",
-            "mean_position_error_m": float(self.position_error.mean()),
-            "largest_position_error_m": float(self.position_error.max()),
-            "final_position_error_m": float(self.position_error[-1]),
-            "mean_rotation_error_deg": float(degrees.mean()),
-            "final_rotation_error_deg": float(degrees[-1]),
-            "down_error_deg": float(np.rad2deg(self.down_error)),
-            "right_face": self.right_face,
-        }
 
 
 def replay(recording: Recording, engine: str = "mujoco", timestep: float = TIMESTEP) -> Replay:

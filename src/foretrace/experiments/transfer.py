@@ -1,113 +1,252 @@
-"""Predictions against a stand-in for the real robot (paper, section 5.4; tables 1 and 2, figure 15).
+"""Predictions against a stand-in for the real robot, or against recordings (paper, section 5.4; tables 1 and 2).
 
 Every lever-up is played several times by the stand-in, each time with other differences from what simulator and
 predictor are told, and its observed path is compared with the path that the simulator of the training data gives for
-the contact as it was told, and with the imagined path. Paths are compared as in the paper: the mean Euclidean distance
+the commanded contact, and with the imagined path. Paths are compared as in the paper: the mean Euclidean distance
 after dynamic time warping. Where the object slips off the blade, both end: afterwards nothing is predicted.
+
+A recording takes the place of one lever-up of the stand-in: the simulator levers up the same object at the same
+contact, with the constants that the data set states; the predictor has the recorded view.
 """
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, cast
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import shapely
 from jaxtyping import Float
-from joblib import Parallel, delayed, parallel_config
-from joblib.externals.loky.process_executor import TerminatedWorkerError
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from matplotlib.figure import Figure
+from tyro.conf import Fixed, Positional, Suppress
 
-from foretrace.errors import PredictionError, ShapeError, SimulationError
-from foretrace.experiments.transfer_objects import Played, Subject, play
+from foretrace.errors import DatasetError, ForetraceError, PredictionError, ResultsError, ShapeError
+from foretrace.evaluation.experiment import Experiment, Row, Trial
+from foretrace.experiments import SUMMARIES
+from foretrace.experiments.training import weights_of
+from foretrace.experiments.transfer_figures import objects_figure, paths_figure
+from foretrace.experiments.transfer_objects import (
+    GIVEN_HEIGHT,
+    GIVEN_SIZE,
+    Played,
+    Subject,
+    everyday_objects,
+    play,
+    printed_shapes,
+    read_prisms,
+    read_silhouettes,
+)
+from foretrace.experiments.transfer_report import PAPER_OBJECTS, RECORDED, recorded_report, report, summarise
+from foretrace.imagined.context import true_context
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
-from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.context import true_values
+from foretrace.predictor import EffectPredictor, load_predictor
+from foretrace.predictor.run_folder import fingerprint
+from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 from foretrace.trajectories import warped_distance
-from foretrace.workers import _ctrl_c_later as ctrl_c_later
 
 CM = 100.0
-
-
-class Example(NamedTuple):
-    """The first repetition at one contact, for pictures."""
-
-    name: str
-    """Name of the object."""
-    group: str
-    """Where it comes from."""
-    contact: int
-    """Number of the contact, from 1."""
-    view: TopDownView
-    """What the predictor saw."""
-    simulated: Interaction
-    """What the simulator made of it."""
-    observed: Observation
-    """What the stand-in showed, or the camera."""
-    imagined: Float[np.ndarray, "time 3"]
-    """The imagined path, up to where the observed one ends [m]."""
+PRINTED_SHOWN = (("pentagon", 1), ("pentagon", 3), ("heptagon", 2), ("heptagon", 6))
+"""Printed edges whose paths are drawn."""
+DRAWN = {"everyday": "figure-15", "silhouettes": "silhouettes", "prisms": "prisms"}
+"""Groups whose masks and errors are drawn, and the name of the picture."""
 
 
 @dataclass(frozen=True)
-class Transfer:
-    """All comparisons of one predictor."""
+class TransferTrial(Trial):
+    """All lever-ups at one contact of one object."""
 
-    rows: pd.DataFrame
-    """One row per observed lever-up; distances in cm, what was drawn in SI units."""
-    examples: list[Example]
-    """One for each contact."""
+    group: str
+    """Where the object comes from."""
+    object: str
+    """Its name."""
+    contact: int
+    """Number of the contact, from 1; of a recording, of the levered edge."""
 
 
-def evaluate_transfer(
-    predictor: EffectPredictor,
-    subjects: Sequence[Subject],
-    stand_in: StandIn | None = None,
-    *,
-    repeats: int = 10,
-    seed: int = 0,
-    workers: int = 1,
-    console: Console | None = None,
-) -> Transfer:
-    """Compare what a predictor imagines, and what the simulator gives, with the stand-in.
+@dataclass(frozen=True)
+class Transfer(Experiment):
+    """Compare predictions with reality, or with a stand-in for it: the paper's tables 1 and 2, and figure 15.
 
-    Args:
-        predictor: Imagines from the stand-in's noisy views.
-        subjects: Objects and where they are levered.
-        stand_in: What stands in for the real robot; by default `StandIn()`.
-        repeats: Lever-ups by the stand-in for each contact.
-        seed: Seed of all that is drawn; what is drawn for one contact does not depend on the other ones.
-        workers: Processes that simulate.
-        console: Where progress is reported; standard error by default.
-
-    Raises:
-        PredictionError: The predictor's features cannot be had from a view.
-        SimulationError: There is nothing to repeat, pybullet is missing, or a worker was killed.
-        ShapeError: Two objects have the same name, or one does not fit in the view.
+    Reality is what `foretrace import` recorded. Without it the stand-in is the other physics engine, Bullet, with other
+    friction, density and thickness, errors of contact, direction, camera and marker, and another sampling rate, all
+    drawn anew every time.
     """
-    stand_in = StandIn() if stand_in is None else stand_in
-    check_sees(predictor)
-    for name, value, least in (("repeats", repeats, 1), ("workers", workers, 1), ("seed", seed, 0)):
-        if value < least:
-            raise SimulationError(f"{name} is {value}, it must be at least {least}")
-    names = [(subject.group, subject.name) for subject in subjects]
-    for group, name in names:
-        if names.count((group, name)) > 1:
+
+    predictor: Positional[Path | None] = None
+    """Folder of the training; by default the predictor that comes with foretrace."""
+    recorded: Path | None = None
+    """Folder of a recorded data set, which takes the place of the stand-in: all options that follow are about that
+    one."""
+    repeats: int | None = None
+    """Lever-ups by the stand-in at every contact; 10 by default."""
+    seed: int | None = None
+    """Seed of all that is drawn; 0 by default."""
+    silhouettes: Path | None = None
+    """Folder of images of more objects, one silhouette each, white on black."""
+    size: float | None = None
+    """Longer side of each silhouette [m]; 0.18 by default."""
+    scale: float | None = None
+    """Metres per pixel of all silhouettes, instead of --size."""
+    prisms: Path | None = None
+    """JSON file of more objects: by name, corners_m and, if they are known, mass_kg and height_m."""
+    height: float | None = None
+    """Thickness of silhouettes, and of prisms whose file does not give it [m]; 0.02 by default."""
+    stand_in: Suppress[Fixed[StandIn | None]] = None
+    """What stands in for the real robot, if not the usual one."""
+    subjects: Suppress[Fixed[tuple[Subject, ...]]] = ()
+    """Objects, if not the paper's."""
+
+    label = "transfer"
+    summary = SUMMARIES["transfer"]
+    trial = TransferTrial
+
+    def __post_init__(self) -> None:
+        names = ("repeats", "seed", "silhouettes", "size", "scale", "prisms", "height")
+        idle = [f"--{name}" for name in names if getattr(self, name) is not None]
+        if idle and self.recorded is not None:
+            raise ResultsError(f"{', '.join(idle)} is about the stand-in: leave it out with --recorded")
+        for name, least in (("repeats", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ResultsError(f"--{name} is {value}, it must be at least {least}")
+        for name in ("size", "scale", "height"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ShapeError(f"--{name} is {value}: give a positive length in metres")
+
+    def trials(self) -> Sequence[TransferTrial]:
+        """One for each contact."""
+        if self.recorded is not None:
+            return sorted(self._recordings, key=lambda trial: (trial.object, trial.contact))
+        return [
+            TransferTrial(group, name, contact + 1)
+            for (group, name), subject in self._subjects.items()
+            for contact in range(len(subject.actions))
+        ]
+
+    def identity(self) -> dict[str, Any]:
+        """The predictor, and the recordings or the stand-in."""
+        check_sees(self._predictor)
+        about = {"model": weights_of(self.predictor), "features": self._predictor.features.label}
+        if self.recorded is not None:
+            return about | {"recorded": fingerprint(self._dataset.batch())}
+        return about | {"repeats": self._repeats, "seed": self.seed or 0, "stand_in": asdict(self._stand_in)}
+
+    def run(self, trial: TransferTrial, folder: Path) -> Sequence[Row]:
+        """A row for each lever-up: distances [cm], and what was drawn in SI units; the first one has paths, too."""
+        if self.recorded is not None:
+            return self._run_recorded(trial)
+        subject = self._subjects[trial.group, trial.object]
+        played = play(subject, trial.contact - 1, self._stand_in, self._repeats, self.seed or 0)
+        return compare_played(self._predictor, played, subject.hull, paths=trial.group == "printed")
+
+    def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
+        """As from `foretrace.experiments.transfer_report.summarise`."""
+        return summarise(rows)
+
+    def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+        """The paper's tables 1 and 2 and figure 15b with ours beside them."""
+        return recorded_report(summary, rows) if RECORDED in set(rows["group"]) else report(summary)
+
+    def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
+        """Paths at some printed or at all recorded edges; masks and errors of the other objects."""
+        figures = {}
+        if "paths_cm" in rows:
+            drawn = rows.loc[rows["paths_cm"].notna()]
+            recorded = drawn.loc[drawn["group"].eq(RECORDED)]
+            shown = drawn.loc[
+                [place in PRINTED_SHOWN for place in zip(drawn["object"], drawn["contact"], strict=True)]
+            ]
+            if len(recorded):
+                note = "The first recording at each edge; the table is grey"
+                figures["figure-14"] = paths_figure(recorded, "recorded", note)
+            elif len(shown):
+                figures["figure-14"] = paths_figure(shown)
+        for group, name in DRAWN.items():
+            mine = rows.loc[rows["group"].eq(group)]
+            subjects = [self._subjects[key] for key in dict.fromkeys(zip(mine["group"], mine["object"], strict=True))
+                        if key in self._subjects]  # fmt: skip
+            if subjects:
+                paper = PAPER_OBJECTS if group == "everyday" else {}
+                figures[name] = objects_figure(subjects, mine, self._stand_in, paper)
+        return figures
+
+    @property
+    def _repeats(self) -> int:
+        return 10 if self.repeats is None else self.repeats
+
+    @cached_property
+    def _stand_in(self) -> StandIn:
+        return self.stand_in or StandIn()
+
+    @cached_property
+    def _predictor(self) -> EffectPredictor:
+        return load_predictor(self.predictor)
+
+    @cached_property
+    def _subjects(self) -> dict[tuple[str, str], Subject]:
+        subjects = list(self.subjects) or printed_shapes() + everyday_objects()
+        height = GIVEN_HEIGHT if self.height is None else self.height
+        if self.silhouettes is not None:
+            size = GIVEN_SIZE if self.size is None else self.size
+            subjects += read_silhouettes(self.silhouettes, size, self.scale, height)
+        if self.prisms is not None:
+            subjects += read_prisms(self.prisms, height)
+        found = {(subject.group, subject.name): subject for subject in subjects}
+        if len(found) < len(subjects):
+            names = [(subject.group, subject.name) for subject in subjects]
+            group, name = next(each for each in names if names.count(each) > 1)
             raise ShapeError(f"two of the {group} are called {name!r}: give every object its own name")
-    contacts = [(subject, k) for subject in subjects for k in range(len(subject.actions))]
-    rows: list[dict[str, Any]] = []
-    examples: list[Example] = []
-    all_played = _play_all(contacts, stand_in, repeats, seed, workers)
-    for (subject, contact), played in _reported(contacts, all_played, console or Console(stderr=True)):
-        found = compare_played(predictor, subject.name, subject.group, contact + 1, played, subject.hull)
-        rows += found[0]
-        examples.append(found[1])
-    return Transfer(pd.DataFrame(rows), examples)
+        return {(str(group), name): subject for (group, name), subject in found.items()}
+
+    @cached_property
+    def _dataset(self) -> Dataset:
+        assert self.recorded is not None
+        dataset = Dataset.open(self.recorded)
+        if len(dataset) == 0:
+            raise DatasetError(f"{self.recorded} has no interaction: import a recording")
+        return dataset
+
+    @cached_property
+    def _recordings(self) -> dict[TransferTrial, list[Interaction]]:
+        """Recordings by object and levered edge; those at one edge of one object count as repetitions."""
+        found: dict[TransferTrial, list[Interaction]] = {}
+        for interaction, number in zip(
+            self._dataset, self._dataset.table["object_id"].to_pylist(), strict=True
+        ):
+            if interaction.provenance.source != "recorded":
+                raise DatasetError(
+                    f"interaction {interaction.id} of {self.recorded} is {interaction.provenance.source}: give a data "
+                    "set that `foretrace import` made"
+                )
+            place = TransferTrial(RECORDED, f"object {number}", levered_edge(interaction) + 1)
+            found.setdefault(place, []).append(interaction)
+        return found
+
+    def _run_recorded(self, trial: TransferTrial) -> list[Row]:
+        rows: list[Row] = []
+        for repetition, interaction in enumerate(self._recordings[trial]):
+            config = SimulationConfig(physics=interaction.physics)
+            try:
+                simulated = simulate_lever_up(interaction.object, interaction.action, config)
+            except ForetraceError as error:
+                raise DatasetError(
+                    f"interaction {interaction.id} of {self.recorded} cannot be simulated: {error}"
+                ) from error
+            played = Played(simulated, (observation_of(interaction),))
+            found = compare_played(self._predictor, played, paths=repetition == 0)
+            rows.append({"interaction": interaction.id, **found[0], "repetition": repetition})
+        return rows
 
 
 def check_sees(predictor: EffectPredictor) -> None:
-    """Refuse a predictor that cannot do with a view.
+    """Refuse a predictor for which a view is not enough.
 
     Raises:
         PredictionError: Its features cannot be had from one.
@@ -120,29 +259,39 @@ def check_sees(predictor: EffectPredictor) -> None:
 
 
 def compare_played(
-    predictor: EffectPredictor, name: str, group: str, contact: int, played: Played, hull: bool = False
-) -> tuple[list[dict[str, Any]], Example]:
-    """Distances of all that was observed at one contact, as rows; and the first of it.
+    predictor: EffectPredictor, played: Played, hull: bool = False, paths: bool = False
+) -> list[dict[str, Any]]:
+    """Distances of all that was observed at one contact, as rows.
 
     Args:
         predictor: The predictor.
-        name: Name of the object.
-        group: Where it comes from.
-        contact: Number of the contact, from 1.
         played: What was simulated and observed there.
-        hull: Whether the predictor sees the convex hull of the object's mask.
+        hull: Whether the predictor has the convex hull of the object's mask.
+        paths: Whether the first row gets the paths, as text.
     """
     exact = played.simulated.view
     own = own_error(predictor, hull_of(exact) if hull else exact, played.simulated)
-    rows, examples = [], []
+    rows = []
     for repetition, observed in enumerate(played.observed):
         view = hull_of(observed.view) if hull else observed.view
         row, imagined = compare(predictor, view, observed, played.simulated)
-        place = {"object": name, "group": group, "contact": contact, "repetition": repetition}
         drawn = {} if observed.perturbation is None else asdict(observed.perturbation)
-        rows.append({**place, **row, "distance_simulated_predicted_cm": own, **drawn})
-        examples.append(Example(name, group, contact, view, played.simulated, observed, imagined))
-    return rows, examples[0]
+        rows.append({"repetition": repetition, **row, "distance_simulated_predicted_cm": own, **drawn})
+        if paths and repetition == 0 and len(observed.com):
+            rows[-1]["paths_cm"] = paths_as_text(played.simulated, observed, imagined)
+    return rows
+
+
+def paths_as_text(
+    simulated: Interaction, observed: Observation, imagined: Float[np.ndarray, "time 3"]
+) -> str:
+    """Observed, predicted and simulated paths [cm] up to the first slip, as JSON."""
+    effect, end = simulated.effect, simulated.effect.slip_index
+    if observed.slip_time is not None:
+        slip = int(np.searchsorted(effect.times, observed.slip_time))
+        end = slip if end is None else min(end, slip)
+    found = {"observed": observed.com, "predicted": imagined, "simulated": effect.com_trajectory[:end]}
+    return json.dumps({name: np.round(CM * path, 4).tolist() for name, path in found.items()})
 
 
 def compare(
@@ -181,10 +330,10 @@ def compare(
     if len(observed.com) == 0:
         return row, np.empty((0, 3))
     physics = observed.physics if told is None else told
-    known = true_values(physics, predictor.known)
-    start = predictor.imagine(view, observed.com[0], known)
+    context = true_context(physics, predictor.context)
+    start = predictor.imagine(view, context=context, com=observed.com[0])
     imagined = start.com_trajectory[_before(start.times, slip)]
-    blind = predictor.imagine(view, known=known)
+    blind = predictor.imagine(view, context=context)
     row["distance_predicted_cm"] = distance_until_slip(observed, start.times, start.com_trajectory)
     row["distance_predicted_from_view_cm"] = distance_until_slip(observed, blind.times, blind.com_trajectory)
     row["final_predicted_cm"] = CM * float(np.linalg.norm(imagined[-1] - observed.com[-1]))
@@ -203,8 +352,8 @@ def own_error(predictor: EffectPredictor, view: TopDownView, simulated: Interact
     effect = simulated.effect
     if len(effect.times) == 0:
         return np.nan
-    known = true_values(simulated.physics, predictor.known, simulated.action.parameters())
-    imagined = predictor.imagine(view, effect.com_trajectory[0], known).com_trajectory
+    context = true_context(simulated.physics, predictor.context, simulated.action.parameters())
+    imagined = predictor.imagine(view, context=context, com=effect.com_trajectory[0]).com_trajectory
     end = slice(None) if effect.slip_index is None else slice(max(1, effect.slip_index))
     return CM * warped_distance(effect.com_trajectory[end], imagined[end]).distance
 
@@ -234,33 +383,23 @@ def _before(times: Float[np.ndarray, " time"], end: float | None) -> slice:
     return slice(None) if end is None else slice(max(1, int(np.searchsorted(times, end))))
 
 
-def _play_all(
-    contacts: Sequence[tuple[Subject, int]], stand_in: StandIn, repeats: int, seed: int, workers: int
-) -> Iterator[Played]:
-    jobs = (delayed(play)(subject, contact, stand_in, repeats, seed) for subject, contact in contacts)
-    with parallel_config("loky", n_jobs=min(workers, max(1, len(contacts))), inner_max_num_threads=1):
-        try:
-            with ctrl_c_later():
-                played = Parallel(return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")(jobs)  # pyright: ignore
-            yield from cast(Iterator[Played], played)
-        except TerminatedWorkerError as error:
-            raise SimulationError(
-                f"a worker process was killed, perhaps for want of memory: repeat with fewer than {workers} workers"
-            ) from error
+def observation_of(interaction: Interaction) -> Observation:
+    """A recorded interaction as what was seen of it, up to where the object slips."""
+    effect = interaction.effect
+    slip = effect.slip_index
+    return Observation(
+        view=interaction.view,
+        times=effect.times[:slip],
+        com=effect.com_trajectory[:slip],
+        slip_time=None if slip is None else float(effect.times[slip]),
+        outcome=effect.outcome,
+        perturbation=None,
+        physics=interaction.physics,
+    )
 
 
-def _reported(
-    contacts: Sequence[tuple[Subject, int]], all_played: Iterator[Played], console: Console
-) -> Iterator[tuple[tuple[Subject, int], Played]]:
-    """The contacts with what was played; progress is a bar on a terminal, elsewhere a line for each object."""
-    columns = (MofNCompleteColumn(), BarColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(contacts))
-        for number, (place, played) in enumerate(zip(contacts, all_played, strict=True), 1):
-            yield place, played
-            subject, contact = place
-            bar.update(task, completed=number, description=subject.name)
-            if not console.is_terminal and contact == len(subject.actions) - 1:
-                console.print(
-                    f"{number}/{len(contacts)} contacts: {subject.name}", highlight=False, markup=False
-                )
+def levered_edge(interaction: Interaction) -> int:
+    """The edge that the contact lies on: edge k runs from corner k to corner k + 1."""
+    corners = interaction.object.corners
+    edges = shapely.linestrings(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+    return int(shapely.distance(edges, shapely.Point(interaction.action.contact)).argmin())

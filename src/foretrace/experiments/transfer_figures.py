@@ -1,6 +1,8 @@
 """Pictures of the comparisons with stand-in or recordings: the paper's figure 15, and figure 14's last panel."""
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import matplotlib as mpl
@@ -13,11 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.experiments.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
-from foretrace.experiments.transfer import Example
+from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.experiments.transfer_objects import Subject
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
-from foretrace.pictures.scene import (
-    ARROW_LENGTH,
+from foretrace.pictures.scene import ARROW_LENGTH
+from foretrace.pictures.style import (
     CM,
     DPI,
     GREY,
@@ -26,6 +28,7 @@ from foretrace.pictures.scene import (
     STYLE,
     TOOL_COLOR,
 )
+from foretrace.simulation.stand_in import Perturbation, StandIn, hull_of
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
 BARS = {"predicted": ("distance_predicted_cm", VERMILLION), "simulated": ("distance_simulated_cm", BLUE)}
@@ -47,16 +50,17 @@ PATHS_PER_ROW = 4
 
 
 def objects_figure(
-    examples: Sequence[Example], rows: pd.DataFrame, paper: Mapping[str, float] | None = None
+    subjects: Sequence[Subject], rows: pd.DataFrame, stand_in: StandIn, paper: Mapping[str, float]
 ) -> Figure:
-    """Masks of objects as the predictor sees them, and the errors on each (paper, figure 15).
+    """Masks of objects as the predictor observes them, and the errors on each (paper, figure 15).
 
     Args:
-        examples: Every contact of the objects.
+        subjects: The objects.
         rows: Their lever-ups.
+        stand_in: What played them; it repeats the views.
         paper: The paper's errors by object [cm].
     """
-    names = list(dict.fromkeys(example.name for example in examples))
+    names = [subject.name for subject in subjects]
     columns = min(len(names), PER_ROW)
     lines = -(-len(names) // columns)
     with mpl.rc_context(STYLE):
@@ -66,13 +70,13 @@ def objects_figure(
         layout = fig.add_gridspec(2, 1, height_ratios=heights)
         above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
         cells = above.subplots(lines, columns, squeeze=False).ravel()
-        for ax, name in zip(cells, names, strict=False):
-            draw_view(ax, [example for example in examples if example.name == name])
+        for ax, subject in zip(cells, subjects, strict=False):
+            draw_view(ax, subject, rows.loc[rows["object"].eq(subject.name)], stand_in)
         for ax in cells[len(names) :]:
             ax.axis("off")
-        draw_errors(below.subplots(), rows, names, paper or {})
+        draw_errors(below.subplots(), rows, names, paper)
         handles = [
-            Patch(color=MASK_COLOR, label="mask that the camera saw"),
+            Patch(color=MASK_COLOR, label="mask of the camera"),
             Patch(color=HULL_COLOR, label="added by its convex hull"),
             Line2D([], [], color=OBJECT_EDGE, linewidth=1, label="true outline"),
             Line2D([], [], color=TOOL_COLOR, linewidth=2.4, marker="^", label="contact shown"),
@@ -89,7 +93,7 @@ def objects_figure(
         below.legend(
             handles=shown, loc="outside lower center", ncols=3, fontsize=8.5, title=note, title_fontsize=8.5
         )
-        title = "Objects as the predictor sees them, and the distance of its path from the stand-in's"
+        title = "Objects as the predictor observes them, and the distance of its path from the stand-in's"
         finish(
             fig,
             title,
@@ -98,20 +102,24 @@ def objects_figure(
     return fig
 
 
-def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
+def draw_view(ax: Axes, subject: Subject, rows: pd.DataFrame, stand_in: StandIn) -> None:
     """One object's mask and hull in the action frame of its first contact, action upwards; scales in cm."""
-    first = examples[0]
-    shown = first.observed.view.mask.astype(int) + first.view.mask
+    row = rows.sort_values(["contact", "repetition"], kind="stable").iloc[0]
+    values = {each.name: float(row[each.name]) for each in fields(Perturbation)}
+    drawn = Perturbation(**values | {"noise_seed": int(values["noise_seed"])})  # pyright: ignore[reportArgumentType]
+    action = subject.actions[int(row["contact"]) - 1]
+    view = stand_in.see(subject.obj, action, drawn)
+    shown = view.mask.astype(int) + (hull_of(view) if subject.hull else view).mask
     edge = np.array([-0.5, VIEW_SIZE - 0.5])
     top, bottom = (CONTACT_PIXEL[0] - edge) * METRES_PER_PIXEL * CM
     left, right = (CONTACT_PIXEL[1] - edge) * METRES_PER_PIXEL * CM
     colors = ListedColormap(["white", HULL_COLOR, MASK_COLOR])
     ax.imshow(shown, cmap=colors, vmin=0, vmax=2, extent=(left, right, bottom, top), interpolation="nearest")
-    T = first.simulated.action.T_action_object
-    outline = first.simulated.object.corners @ T[:2, :2].T + T[:2, 3]
+    T = action.T_action_object
+    outline = subject.obj.corners @ T[:2, :2].T + T[:2, 3]
     closed = np.concatenate([outline, outline[:1]]) * CM
     ax.plot(closed[:, 1], closed[:, 0], color=OBJECT_EDGE, linewidth=1)
-    contacts = np.array([example.simulated.action.contact for example in examples[1:]])
+    contacts = np.array([other.contact for other in subject.actions if other is not action])
     if len(contacts):
         others = (contacts @ T[:2, :2].T + T[:2, 3]) * CM
         ax.plot(others[:, 1], others[:, 0], "o", color=INK, markersize=4)
@@ -122,7 +130,7 @@ def draw_view(ax: Axes, examples: Sequence[Example]) -> None:
     ax.set(
         xlim=(middle[1] + half, middle[1] - half), ylim=(middle[0] - half, middle[0] + half), aspect="equal"
     )
-    ax.set_title(first.name, loc="center")
+    ax.set_title(subject.name, loc="center")
     ax.set(xticks=[], yticks=[])
     ax.spines[["left", "bottom"]].set_visible(False)
     ax.plot(
@@ -167,26 +175,29 @@ def draw_errors(ax: Axes, rows: pd.DataFrame, names: Sequence[str], paper: Mappi
 
 
 def paths_figure(
-    examples: Sequence[Example],
+    rows: pd.DataFrame,
     observed: str = "stand-in",
     note: str = "The stand-in is Bullet with other constants and errors, not a robot; the table is grey",
 ) -> Figure:
     """Paths of the centre of mass from the side: observed, predicted, simulated (paper, figure 14, last panel).
 
     Args:
-        examples: What is shown, four in a row.
+        rows: Lever-ups that have paths; four are shown in a row.
         observed: What the observed path is called.
         note: What stands under the title.
     """
-    columns = min(len(examples), PATHS_PER_ROW)
-    lines = -(-len(examples) // columns)
+    columns = min(len(rows), PATHS_PER_ROW)
+    lines = -(-len(rows) // columns)
     with mpl.rc_context(STYLE):
         width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
         fig = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
         cells = fig.subplots(lines, columns, squeeze=False).ravel()
-        for ax, example in zip(cells, examples, strict=False):
-            draw_example(ax, example)
-        for ax in cells[len(examples) :]:
+        for ax, row in zip(cells, rows.to_dict("records"), strict=False):
+            paths = {name: np.array(path) / CM for name, path in json.loads(row["paths_cm"]).items()}
+            slip = row.get("slip_time", np.nan)
+            slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
+            draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
+        for ax in cells[len(rows) :]:
             ax.axis("off")
         handles = [
             Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
@@ -206,7 +217,7 @@ def side_figure(
 
     Args:
         observed: Centre of mass in the action frame [m].
-        predicted: The same as it was imagined.
+        predicted: The same as predicted.
         title: What the recording is called.
     """
     with mpl.rc_context(STYLE):
@@ -216,22 +227,6 @@ def side_figure(
         ax.legend(loc="upper left")
         finish(fig, "Paths of the centre of mass from the side", "The table is grey")
     return fig
-
-
-def draw_example(ax: Axes, example: Example) -> None:
-    """One contact's paths from the side, up to the first slip."""
-    effect, observed = example.simulated.effect, example.observed
-    end = effect.slip_index
-    if observed.slip_time is not None:
-        slip = int(np.searchsorted(effect.times, observed.slip_time))
-        end = slip if end is None else min(end, slip)
-    slipped = "" if observed.slip_time is None else f", slips at {observed.slip_time:.1f} s"
-    paths = {
-        "observed": observed.com,
-        "predicted": example.imagined,
-        "simulated": effect.com_trajectory[:end],
-    }
-    draw_paths(ax, paths, f"{example.name}, contact {example.contact}{slipped}")
 
 
 def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: str) -> None:

@@ -28,6 +28,8 @@ from foretrace.simulation.stand_in import Observation, StandIn
 
 Group = Literal["printed", "everyday", "silhouettes", "prisms"]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+GIVEN_SIZE = 0.18
+"""Longer side of given silhouettes [m]."""
 GIVEN_HEIGHT = 0.02
 """Thickness of given objects that do not tell it [m]."""
 NUM_CONTACTS = 5
@@ -183,7 +185,7 @@ def play(subject: Subject, contact: int, stand_in: StandIn, repeats: int, seed: 
 
 
 def read_silhouettes(
-    folder: Path, size: float = 0.18, scale: float | None = None, height: float = GIVEN_HEIGHT
+    folder: Path, size: float = GIVEN_SIZE, scale: float | None = None, height: float = GIVEN_HEIGHT
 ) -> list[Subject]:
     """Objects from a folder of pictures, one silhouette each, white on black.
 

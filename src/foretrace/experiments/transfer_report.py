@@ -6,8 +6,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from foretrace.evaluation.tables import markdown_table, number
 from foretrace.interactions.record import Outcome
 
+RECORDED = "recorded"
+"""Group of recorded lever-ups."""
 PAPER_SIMULATED = {
     "pentagon": (0.485, 0.520, 0.379, 0.385, 0.474),
     "heptagon": (0.447, 0.910, 0.368, 0.333, 0.720, 0.864, 0.338),
@@ -40,10 +43,10 @@ NOTE = (
 RECORDED_NOTE = (
     "Every recorded lever-up against the simulation of the same object, contact and path, and against what the "
     "predictor imagines from the recorded view. Friction and density of a recording are not known: the simulator has "
-    "the usual ones. Distances in cm: mean over the paths after dynamic time warping, up to where the object slips off "
+    "nominal ones. Distances in cm: mean over the paths after dynamic time warping, up to where the object slips off "
     "the blade."
 )
-EDGED = {"printed": "every printed edge", "recorded": "every recorded edge"}
+EDGED = {"printed": "every printed edge", RECORDED: "every recorded edge"}
 """Groups whose contacts are edges, and what a bar calls them."""
 
 
@@ -51,11 +54,12 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     """Everything that the tables tell, JSON-able.
 
     Args:
-        rows: As in `foretrace.experiments.transfer.Transfer`.
+        rows: Of `foretrace.experiments.transfer.Transfer`.
 
     Returns:
         ``edges``: one entry for each edge of a printed or recorded shape; ``objects``: one for each other object;
-        ``bars``: which means and which single lever-ups lie below the bars; ``outcomes``: how often what happened.
+        ``bars``: which means and which single lever-ups lie below the bars; ``outcomes``: how many there are of each;
+        ``repeats``: most lever-ups at one contact; ``note``: what is compared.
     """
     edges: list[dict[str, Any]] = []
     objects: list[dict[str, Any]] = []
@@ -87,7 +91,10 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
             bars += [_bar(words, mine, part, bar) for bar in (PAPER_BAR, GOAL)]
     if everyday:
         bars.append(_bar("every everyday object", everyday, rows.loc[rows["group"].eq("everyday")], GOAL))
-    return {"edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
+    note = RECORDED_NOTE if RECORDED in set(rows["group"]) else NOTE
+    repeats = int(rows["repetition"].to_numpy().max()) + 1
+    about = {"note": note, "repeats": repeats}
+    return {**about, "edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
 
 
 def _listed(numbers: Mapping[str, Sequence[float]], name: str, at: int) -> float | None:
@@ -140,14 +147,15 @@ def bar_lines(summary: Mapping[str, Any], observed: str = "stand-in") -> list[st
     return lines
 
 
-def markdown(summary: Mapping[str, Any], repeats: int) -> str:
+def report(summary: Mapping[str, Any]) -> str:
     """The paper's tables 1 and 2 and figure 15b with ours beside them."""
+    repeats = summary["repeats"]
     parts = ["# Predictions against a stand-in for the real robot", NOTE]
-    for number, name in enumerate(PAPER_PREDICTED, 1):
+    for table, name in enumerate(PAPER_PREDICTED, 1):
         entries = [entry for entry in summary["edges"] if entry["object"] == name]
         if entries:
             heads = [f"Edge {entry['edge']}" for entry in entries]
-            title = f"## Table {number}: {name}, {repeats} lever-ups at each edge"
+            title = f"## Table {table}: {name}, {repeats} lever-ups at each edge"
             parts += [title, _table(heads, entries, ("simulated", "predicted"))]
     for group, title in (
         ("everyday", "Figure 15b: everyday objects"),
@@ -167,7 +175,7 @@ def markdown(summary: Mapping[str, Any], repeats: int) -> str:
     return "\n\n".join([*parts, "## Bars", bars]) + "\n"
 
 
-def recorded_markdown(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+def recorded_report(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
     """Tables 1 and 2 of recorded lever-ups: one for each object, and one with every interaction.
 
     Args:
@@ -183,10 +191,12 @@ def recorded_markdown(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
     lines = [["Interaction", "Object", "Edge", "Outcome", "Simulated", "vs simulation", "vs predicted"]]
     for row in rows.to_dict("records"):
         distances = (row[DISTANCES[kind]] for kind in ("simulated", "predicted"))
-        numbers = [_number(None if np.isnan(value) else value) for value in distances]
+        numbers = [number(value) for value in distances]
         lines.append([*(str(row[column]) for column in columns), *numbers])
-    bars = "\n".join(f"- {line}" for line in bar_lines(summary, "recorded"))
-    return "\n\n".join([*parts, "## Interactions", _rows(lines), "## Bars", bars]) + "\n"
+    bars = "\n".join(f"- {line}" for line in bar_lines(summary, RECORDED))
+    return (
+        "\n\n".join([*parts, "## Interactions", markdown_table(lines[0], lines[1:]), "## Bars", bars]) + "\n"
+    )
 
 
 def _table(
@@ -202,18 +212,18 @@ def _table(
         word = {"simulated": "simulation", "predicted": "predicted"}[kind]
         paper = [entry["paper"].get(kind) for entry in entries]
         if any(value is not None for value in paper):
-            lines.append([f"Paper: real vs {word}", *map(_number, paper)])
+            lines.append([f"Paper: real vs {word}", *map(number, paper)])
         lines += [
-            [f"{observed} vs {word}, {words}", *(_number(entry[kind][key]) for entry in entries)]
+            [f"{observed} vs {word}, {words}", *(number(entry[kind][key]) for entry in entries)]
             for key, words in STATISTICS.items()
             if repeated or key == "mean"
         ]
-    blind = [_number(entry["predicted_from_view"]["mean"]) for entry in entries]
+    blind = [number(entry["predicted_from_view"]["mean"]) for entry in entries]
     lines.append([f"{observed} vs predicted from the view alone, mean", *blind])
-    own = [_number(entry["simulated_predicted"]["mean"]) for entry in entries]
+    own = [number(entry["simulated_predicted"]["mean"]) for entry in entries]
     lines.append(["Simulation vs predicted, told everything", *own])
     lines.append(["Not levered", *(_others(entry["outcomes"]) for entry in entries)])
-    return _rows(lines)
+    return markdown_table(lines[0], lines[1:])
 
 
 def _long_table(entries: Sequence[Mapping[str, Any]]) -> str:
@@ -224,17 +234,8 @@ def _long_table(entries: Sequence[Mapping[str, Any]]) -> str:
     ]
     for entry in entries:
         numbers = [entry[kind][key] for kind in ("predicted", "simulated") for key in STATISTICS]
-        lines.append([entry["object"], *map(_number, numbers), _others(entry["outcomes"])])
-    return _rows(lines)
-
-
-def _rows(lines: Sequence[Sequence[str]]) -> str:
-    rule = ["---", *["---:"] * (len(lines[0]) - 1)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in (lines[0], rule, *lines[1:]))
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+        lines.append([entry["object"], *map(number, numbers), _others(entry["outcomes"])])
+    return markdown_table(lines[0], lines[1:])
 
 
 def _others(outcomes: Mapping[str, int]) -> str:

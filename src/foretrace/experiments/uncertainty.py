@@ -1,32 +1,58 @@
-"""How far to trust a predictor that tells of several futures: probabilities, regions, samples, observed beginnings.
+"""How far to trust a predictor of several futures: probabilities, regions, samples, observed beginnings.
 
-Whole records of all outcomes are learned and judged: an object that slips off the blade falls back, and that is an
+Whole records of all outcomes are learned and evaluated: an object that slips off the blade falls back, and that is an
 effect, too. Split ``shuffled`` is the paper's. In ``novel-shapes``, objects of some corner counts are tested and the
 others learned from, so regions whose widths were measured on known shapes meet shapes that they were not made for.
 """
 
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from tyro.conf import Fixed, Suppress
 
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, ResultsError
+from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, kept_folder
+from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
+from foretrace.evaluation.tables import markdown_table, mean_with_interval
+from foretrace.experiments import SUMMARIES
+from foretrace.experiments.training import Recipe
+from foretrace.experiments.uncertainty_figures import (
+    BEGINNING_WORDS,
+    SPLIT_WORDS,
+    confusion_figure,
+    observed_figure,
+    reliability_figure,
+)
 from foretrace.experiments.uncertainty_metrics import (
+    ALL,
+    BEGINNINGS,
+    FORECASTS,
+    OBSERVED,
+    SCORES,
+    SHOWN_LEVELS,
     UNLIKE,
     Part,
+    constant_deviations,
+    draw,
+    evaluate_errors,
+    evaluate_observed,
+    evaluate_outcomes,
+    evaluate_regions,
     futures_of,
-    judge_errors,
-    judge_observed,
-    judge_outcomes,
-    judge_regions,
+    score,
 )
-from foretrace.experiments.uncertainty_scores import constant_deviations, draw, score
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
-from foretrace.predictor import RECIPES, OneShotPredictor, TrainConfig, train_predictor
+from foretrace.predictor import OneShotPredictor, load_predictor
+from foretrace.predictor.config import Device
+from foretrace.predictor.one_shot import FEW
+from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_lengths
 
 Setting = Literal["shuffled", "novel-shapes"]
@@ -34,12 +60,177 @@ SETTINGS: tuple[Setting, ...] = ("shuffled", "novel-shapes")
 """How the split is drawn."""
 HELD_OUT = (5, 6)
 """Corner counts of novel shapes, by default."""
-RECIPE = RECIPES[OneShotPredictor.label]
-"""What predictors are trained with; outcomes and seed are replaced."""
+KEPT = "trainings"
+"""Folder of the trainings within the results."""
+PARTS = ("train", "validation", "test")
+ERRORS = {
+    "full": "Full [cm]",
+    "final": "Final [cm]",
+    "full_median": "Full, median [cm]",
+    "until_slip_full": "Full, until slip [cm]",
+    "until_slip_final": "Final, until slip [cm]",
+    "nearest_full": "Nearest, full [cm]",
+    "nearest_final": "Nearest, final [cm]",
+    "futures": "Futures",
+    "rotation": "Rotation, median [°]",
+    "final_rotation": "Final rotation, median [°]",
+}
+WORDS = {
+    **SPLIT_WORDS,
+    **BEGINNING_WORDS,
+}
+DIGITS = 4
+
+Numbers = Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class UncertaintyTrial(Trial):
+    """One training and all that is measured of it."""
+
+    split: str
+    """One of SETTINGS."""
+    seed: int
+    """Seed of split, training and samples."""
+
+
+@dataclass(frozen=True)
+class Uncertainty(Experiment):
+    """Evaluate what the one-shot predictor predicts: probabilities, regions, samples, and observed beginnings."""
+
+    data: Path | None = None
+    """Folder of the data set; all outcomes in it are learned and evaluated. Without one nothing is trained: results
+    that are there are drawn again."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of splits, trainings and samples."""
+    splits: tuple[Setting, ...] = SETTINGS
+    """shuffled: the paper's sizes, any interaction in any part. novel-shapes: tested on corner counts that were not
+    learned from."""
+    held_out: tuple[int, ...] = HELD_OUT
+    """Corner counts of the novel shapes."""
+    epochs: int | None = None
+    """Passes over the training part, as in `foretrace train`."""
+    samples: int = 100
+    """Motions drawn at random for each interaction."""
+    unlike: Path | None = None
+    """Folder of a data set with other physics, sampled at the same times, for instance simulated with `--randomise`.
+    The gain by observed beginnings is measured on it, too, for shuffled splits."""
+    device: Device = "auto"
+    """Where to train."""
+    recipe: Suppress[Fixed[Recipe | None]] = None
+    """Other settings of the trainings than the predictor's."""
+
+    label = "uncertainty"
+    summary = SUMMARIES["uncertainty"]
+    trial = UncertaintyTrial
+    formats = ("png", "svg")
+
+    def __post_init__(self) -> None:
+        checked_seeds(self.seeds)
+        if not self.splits:
+            raise ResultsError("no split is given: give shuffled, novel-shapes or both")
+        if self.samples < 2:
+            raise ResultsError(f"--samples is {self.samples}: give a number from 2")
+
+    def trials(self) -> Sequence[UncertaintyTrial]:
+        """Split by split, seed by seed; none without data."""
+        if self.data is None:
+            return []
+        trials = [UncertaintyTrial(name, seed) for name in self.splits for seed in checked_seeds(self.seeds)]
+        for trial in trials:
+            self._split(trial)
+        return trials
+
+    def identity(self) -> dict[str, Any] | None:
+        """The data, how predictors are trained, and what is measured."""
+        if self.data is None:
+            return None
+        other = None if self._unlike is None else fingerprint(self._unlike)
+        about = {"data": fingerprint(self._batch), "unlike": other, "recipe": self._recipe.describe()}
+        return about | {"held_out": list(self.held_out), "samples": self.samples}
+
+    def run(self, trial: UncertaintyTrial, folder: Path) -> Sequence[Row]:
+        """As `measure`."""
+        split = self._split(trial)
+        outcomes = tuple(np.unique(self._batch.outcome).tolist())
+        recipe = self._recipe.change(outcomes=outcomes, seed=trial.seed)
+        out = kept_folder(folder, KEPT) / f"{trial.split}-{trial.seed}"
+        predictor = load_predictor(recipe.train(self._batch, split, out))
+        assert isinstance(predictor, OneShotPredictor)
+        unlike = self._unlike if trial.split == "shuffled" else None
+        return measure(predictor, self._batch, split, trial.seed, self.samples, unlike).to_dict("records")
+
+    def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
+        """Means over the seeds and their 95 % intervals.
+
+        By split: ``seeds``; ``values``, by metric, group and, if there are any, level; ``few``: outcomes of which some
+        part has fewer than `FEW` examples. Regions are shown at `SHOWN_LEVELS` only.
+        """
+        summary: dict[str, Any] = {}
+        shown = rows.loc[rows["metric"].ne("coverage") | rows["level"].isin(SHOWN_LEVELS)]
+        for split in dict.fromkeys(shown["split"]):
+            mine = shown.loc[shown["split"].eq(split)]
+            values: dict[str, Any] = {}
+            ratio = test_to_train(mine)
+            for (metric, group, level), part in mine.groupby(
+                ["metric", "group", "level"], dropna=False, sort=False
+            ):
+                numbers = _numbers(part.sort_values("seed")["value"].to_numpy(float), ratio)
+                found = values.setdefault(metric, {})
+                if np.isnan(level):
+                    found[group] = numbers
+                else:
+                    found.setdefault(group, {})[f"{level:g}"] = numbers
+            counts = mine.loc[mine["metric"].str.startswith("count_")]
+            few = sorted(set(counts.loc[counts["value"].lt(FEW), "group"]))
+            summary[split] = {"seeds": sorted(map(int, set(mine["seed"]))), "few": few, "values": values}
+        return summary
+
+    def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+        """All tables, split by split."""
+        parts = ["# Several futures, evaluated", "Means over the seeds, 95 % intervals in brackets."]
+        for split, found in summary.items():
+            values = found["values"]
+            seeds = ", ".join(map(str, found["seeds"]))
+            parts += [f"## {WORDS.get(split, split)}, seeds {seeds}", *_examples(values, found["few"])]
+            parts += ["### Outcomes", *_outcomes(values)]
+            parts += ["### Errors of the most probable and of the nearest future", _errors(values)]
+            parts += ["### Regions", *_regions(values)]
+            parts += ["### Scores of samples; less is better", _scores(values)]
+            parts += ["### The rest of the motion, after some samples were observed", *_observed(values)]
+            if f"{UNLIKE}{BEGINNINGS[0]}_rest" in values:
+                parts += ["### The same of lever-ups with other physics than those learned from"]
+                parts += _observed(values, UNLIKE)
+        return "\n\n".join(parts) + "\n"
+
+    def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
+        """Coverage of regions, gain by observed samples, and confusion of outcomes."""
+        return {
+            "reliability": reliability_figure(rows),
+            "observed": observed_figure(rows),
+            "confusion": confusion_figure(rows),
+        }
+
+    @cached_property
+    def _batch(self) -> InteractionBatch:
+        assert self.data is not None
+        return load(self.data)
+
+    @cached_property
+    def _unlike(self) -> InteractionBatch | None:
+        return None if self.unlike is None else load(self.unlike, like=self._batch)
+
+    @cached_property
+    def _recipe(self) -> Recipe:
+        recipe = Recipe.of(OneShotPredictor.label) if self.recipe is None else self.recipe
+        return recipe.change(epochs=self.epochs, device=self.device)
+
+    def _split(self, trial: UncertaintyTrial) -> Split:
+        return split_of(self._batch, trial.split, trial.seed, self.held_out)
 
 
 def load(data: str | Path, like: InteractionBatch | None = None) -> InteractionBatch:
-    """All interactions that have a motion to learn from, whatever became of the objects.
+    """All interactions that have a motion to learn from, whatever their outcome.
 
     Args:
         data: Folder of the data set.
@@ -60,38 +251,11 @@ def load(data: str | Path, like: InteractionBatch | None = None) -> InteractionB
     return batch
 
 
-def split_of(
-    batch: InteractionBatch, setting: Setting, seed: int, held_out: Collection[int] = HELD_OUT
-) -> Split:
+def split_of(batch: InteractionBatch, setting: str, seed: int, held_out: Collection[int] = HELD_OUT) -> Split:
     """Parts of the paper's sizes, or its proportions of fewer data; or with novel shapes as the test part."""
     if setting == "novel-shapes":
         return split_by_corner_count(batch.num_corners, held_out, seed)
     return split_by_seed(len(batch), seed, PAPER_SIZES if len(batch) >= sum(PAPER_SIZES) else None)
-
-
-def train(
-    batch: InteractionBatch, out: Path, seed: int, split: Split, config: TrainConfig, progress: bool = True
-) -> Path:
-    """Train on all outcomes that occur, unless that is done already.
-
-    Args:
-        batch: The interactions.
-        out: Folder of the training; one that was cut short goes on.
-        seed: Of the training.
-        split: As from `split_of`.
-        config: Further settings; outcomes and seed are replaced.
-        progress: Show a progress bar.
-
-    Returns:
-        The folder.
-
-    Raises:
-        TrainingError: It holds another training.
-    """
-    outcomes = tuple(np.unique(batch.outcome).tolist())
-    return train_predictor(
-        batch, replace(config, outcomes=outcomes, seed=seed), out, split=split, progress=progress
-    )
 
 
 def measure(
@@ -102,7 +266,7 @@ def measure(
     samples: int = 100,
     unlike: InteractionBatch | None = None,
 ) -> pd.DataFrame:
-    """All that is to be told about one predictor.
+    """All that is measured of one predictor.
 
     Args:
         predictor: The predictor.
@@ -110,13 +274,13 @@ def measure(
         split: Those of its training. The validation part fits the forecasts that its samples are compared with.
         seed: Seed of the samples.
         samples: Motions drawn at random for each interaction.
-        unlike: Interactions with other physics than those learned from, sampled alike. Of these, only what observed
-            samples are worth is judged; their metrics begin with `UNLIKE`.
+        unlike: Interactions with other physics than those learned from, sampled alike. Of these, only the gain by
+            observed samples is measured; their metrics begin with `UNLIKE`.
 
     Returns:
         ``metric``, ``group`` (`uncertainty_metrics.ALL` or an outcome; of ``confusion``, what happened and what was
-        said), ``level`` (of a region, or the number of observed samples; else NaN), ``value``. The page on uncertainty
-        tells what metrics mean.
+        predicted), ``level`` (of a region, or the number of observed samples; else NaN), ``value``. The page on
+        uncertainty explains the metrics.
     """
     test, validation = (Part.of(predictor, batch[rows]) for rows in (split.test, split.validation))
     parts = {"train": split.train, "validation": split.validation, "test": split.test}
@@ -126,16 +290,114 @@ def measure(
         for name, rows in parts.items()
     ]
     imagined = test.imagine(predictor)
-    found += judge_outcomes(futures_of(imagined).outcomes(), test.batch.outcome)
-    found += judge_errors(imagined, test)
-    found += judge_regions(futures_of(imagined), test)
+    found += evaluate_outcomes(futures_of(imagined).outcomes(), test.batch.outcome)
+    found += evaluate_errors(imagined, test)
+    found += evaluate_regions(futures_of(imagined), test)
     mixture = test.mixture(predictor)
     deviations = constant_deviations(validation.imagine(predictor).com - validation.com, validation.valid)
     for name, drawn in draw(mixture, imagined.com, deviations, samples, seed):
         for metric, values in score(drawn, test.com, test.valid).items():
             found += test.means(f"{name}_{metric}", values)
-    found += judge_observed(predictor, test)
+    found += evaluate_observed(predictor, test)
     if unlike is not None:
         other = Part.of(predictor, unlike[np.isin(unlike.outcome, predictor.outcomes)])
-        found += [(UNLIKE + metric, *row) for metric, *row in judge_observed(predictor, other)]
+        found += [(UNLIKE + metric, *row) for metric, *row in evaluate_observed(predictor, other)]
     return pd.DataFrame(found, columns=["metric", "group", "level", "value"])
+
+
+def test_to_train(rows: pd.DataFrame) -> float:
+    """Size of the test part divided by that of the training part."""
+    sizes = rows.loc[rows["metric"].isin(["count_test", "count_train"])].groupby("metric")["value"].sum()
+    return (
+        float(sizes.get("count_test", np.nan) / sizes.get("count_train", np.nan))
+        if len(sizes) == 2
+        else TEST_TO_TRAIN
+    )
+
+
+def _numbers(values: np.ndarray, ratio: float) -> dict[str, float | None]:
+    if not np.isfinite(values).all():  # a region that is everything has no width
+        return dict.fromkeys(("mean", "low", "high"))
+    return interval(values, ratio).as_dict(DIGITS)
+
+
+def _examples(values: Mapping[str, Any], few: Sequence[str]) -> list[str]:
+    outcomes = list(values["count_test"])
+    lines = [["Outcome", *PARTS]]
+    for name in outcomes:
+        lines.append([f"`{name}`", *(f"{values[f'count_{part}'][name]['mean']:.4g}" for part in PARTS)])
+    notes = []
+    if few:
+        named = ", ".join(f"`{name}`" for name in few)
+        notes = [f"Too few examples (fewer than {FEW} in some part of some split) of: {named}."]
+    return ["Interactions in each part:", markdown_table(lines[0], lines[1:]), *notes]
+
+
+def _outcomes(values: Mapping[str, Any]) -> list[str]:
+    macro, brier = _cell(values["macro_f1"][ALL], 3), _cell(values["brier"][ALL], 3)
+    right, common = (_cell(values[name][ALL], 3) for name in ("accuracy", "accuracy_of_most_common"))
+    text = (
+        f"Macro-F1 {macro}; accuracy {right} ({common} for naming the most common one); Brier score {brier}."
+    )
+    names = list(values["count_test"])
+    lines = [["Happened", *(f"predicted `{name}`" for name in names), "F1"]]
+    for name in names:
+        counts = (values["confusion"][f"{name}, predicted {other}"]["mean"] for other in names)
+        f1 = _cell(values["f1"].get(name), 3)
+        lines.append([f"`{name}`", *(f"{count:.4g}" for count in counts), f1])
+    return [text, markdown_table(lines[0], lines[1:])]
+
+
+def _errors(values: Mapping[str, Any]) -> str:
+    lines = [["", *ERRORS.values()]]
+    for group in values["full"]:
+        lines.append([_name(group), *(_cell(values[metric][group], 3) for metric in ERRORS)])
+    return markdown_table(lines[0], lines[1:])
+
+
+def _regions(values: Mapping[str, Any]) -> list[str]:
+    found = []
+    for metric, words, digits in (
+        ("coverage", "Share of motions that stay within a tube all the time:", 3),
+        ("tube", "Median radius of the most probable future's tube [cm]:", 2),
+    ):
+        lines = [["", *(f"{level:.0%}" for level in SHOWN_LEVELS)]]
+        for group, by_level in values[metric].items():
+            cells = (_cell(by_level[f"{level:g}"], digits) for level in SHOWN_LEVELS)
+            lines.append([_name(group), *cells])
+        found += [words, markdown_table(lines[0], lines[1:])]
+    return found
+
+
+def _scores(values: Mapping[str, Any]) -> str:
+    lines = [["Samples of", "", *SCORES.values()]]
+    for forecast, words in FORECASTS.items():
+        for group in values[f"{forecast}_crps"]:
+            cells = (_cell(values[f"{forecast}_{name}"][group], 3) for name in SCORES)
+            lines.append([words, _name(group), *cells])
+    return markdown_table(lines[0], lines[1:])
+
+
+def _observed(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found = []
+    for name in BEGINNINGS:
+        beginning = prefix + name
+        levels = [f"{k}" for k in OBSERVED if f"{k}" in values[f"{beginning}_rest"].get(ALL, {})]
+        lines = [["Observed samples", *levels]]
+        for group in values[f"{beginning}_rest"]:
+            for metric, words in (("rest", "error [cm]"), ("rest_ratio", "÷ unobserved")):
+                by_level = values[f"{beginning}_{metric}"][group]
+                cells = (_cell(by_level.get(level), 3) for level in levels)
+                lines.append([f"{_name(group)}, {words}", *cells])
+        scores = values[f"{beginning}_macro_f1"][ALL]
+        lines.append(["Macro-F1 of outcomes", *(_cell(scores.get(level), 3) for level in levels)])
+        found += [f"Samples counted {WORDS[name]}:", markdown_table(lines[0], lines[1:])]
+    return found
+
+
+def _name(group: str) -> str:
+    return "All" if group == ALL else f"`{group}`"
+
+
+def _cell(numbers: Numbers | None, digits: int) -> str:
+    return mean_with_interval(numbers, digits, missing="-")

@@ -10,13 +10,14 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FormatStrFormatter
 from scipy.stats import betabinom
 
-from foretrace.experiments.charts import BLUE, GRID, QUIET, REFERENCE, VERMILLION, finish, grid
+from foretrace.evaluation.charts import BLUE, GRID, QUIET, REFERENCE, VERMILLION, finish, grid
 from foretrace.experiments.uncertainty_metrics import ALL, BEGINNINGS
-from foretrace.experiments.uncertainty_report import WORDS
 from foretrace.imagined import LEVELS
 from foretrace.interactions.record import Outcome
-from foretrace.pictures.scene import DPI, INK, OUTCOME_COLORS, STYLE
+from foretrace.pictures.style import DPI, INK, OUTCOME_COLORS, STYLE
 
+SPLIT_WORDS = {"shuffled": "Shuffled", "novel-shapes": "Novel shapes"}
+BEGINNING_WORDS = {"record": "since the record's start", "moving": "since the object moves"}
 SPLIT_COLORS = {"shuffled": BLUE, "novel-shapes": VERMILLION}
 MARKERS = {ALL: "o", "levered": "s", "slipped": "^", "tumbled": "D", "rolled": "v", "missed": "P"}
 FOUND = [10, 25, 50, 75, 90]
@@ -36,7 +37,7 @@ def reliability_figure(rows: pd.DataFrame) -> Figure:
             fig.subplots(1, len(splits), squeeze=False, sharey=True)[0], splits, strict=True
         ):
             _draw_reliability(ax, rows.loc[rows["split"].eq(split)], SPLIT_COLORS.get(split, BLUE))
-            ax.set_title(WORDS.get(split, split))
+            ax.set_title(SPLIT_WORDS.get(split, split))
         fig.axes[0].set_ylabel("motions that stay within [%]")
         handles = [
             Line2D([], [], color=INK, linewidth=2.2, label="mean over the seeds"),
@@ -105,7 +106,7 @@ def observed_figure(rows: pd.DataFrame) -> Figure:
                 ax.set_yscale("log")
                 grid(ax)
                 ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-                ax.set_title(f"{WORDS.get(split, split)}, samples {WORDS[beginning]}")
+                ax.set_title(f"{SPLIT_WORDS.get(split, split)}, samples {BEGINNING_WORDS[beginning]}")
             line[0].set_ylabel("error of the rest [cm]")
         for ax in axes[-1]:
             ax.set_xlabel("observed samples")
@@ -125,7 +126,7 @@ def observed_figure(rows: pd.DataFrame) -> Figure:
         ]
         fig.legend(handles=handles, loc="outside lower center", ncols=len(handles), columnspacing=1.4)
         note = "mean error of the most probable future; bands: from the best to the worst seed"
-        finish(fig, "What observing the beginning of a motion tells of its rest", note)
+        finish(fig, "Gain by observing the beginning of a motion", note)
     return fig
 
 
@@ -162,7 +163,7 @@ def confusion_figure(rows: pd.DataFrame) -> Figure:
         for ax, split in zip(fig.subplots(1, len(splits), squeeze=False)[0], splits, strict=True):
             mine = rows.loc[rows["split"].eq(split) & rows["metric"].eq("confusion")]
             sums = mine.groupby("group")["value"].sum()
-            counts = np.array([[sums.get(f"{a}, said {b}", 0.0) for b in names] for a in names])
+            counts = np.array([[sums.get(f"{a}, predicted {b}", 0.0) for b in names] for a in names])
             shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
             ax.imshow(shares, cmap="Blues", vmin=0, vmax=1)
             for (i, j), share in np.ndenumerate(shares):
@@ -173,6 +174,8 @@ def confusion_figure(rows: pd.DataFrame) -> Figure:
             ax.set_yticks(range(len(names)), names, rotation=90, va="center")
             ax.tick_params(length=0)
             ax.spines[:].set_visible(False)
-            ax.set(title=WORDS.get(split, split), xlabel="said to be most probable", ylabel="happened")
+            ax.set(
+                title=SPLIT_WORDS.get(split, split), xlabel="predicted to be most probable", ylabel="happened"
+            )
         finish(fig, "Which outcomes are taken for which", "lever-ups of the test parts; % of what happened")
     return fig

@@ -1,22 +1,42 @@
-"""What is measured of several futures: outcomes, errors, regions, and the rest of a motion that is under way."""
+"""What is measured of several futures: outcomes, errors, regions, samples, and the rest of a motion that is under way.
 
-from collections.abc import Mapping
+Samples have proper scores (Gneiting and Raftery, 2007, "Strictly proper scoring rules, prediction, and estimation"): a
+forecast that states what it believes has the best expected score. Beside the predictor's own samples, those of a
+Gaussian of constant width are scored. A forecast without any spread scores its mean error.
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scoringrules
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foretrace.evaluation.metrics import METRICS
-from foretrace.imagined import LEVELS
+from foretrace.imagined import LEVELS, Futures, ImaginedBatch
+from foretrace.imagined.context import recorded_context
 from foretrace.interactions.dataset import InteractionBatch
-from foretrace.predictor import Futures, ImaginedBatch, OneShotPredictor
-from foretrace.predictor.context import observed_values
+from foretrace.predictor import OneShotPredictor
 from foretrace.predictor.mixture import Mixture
 from foretrace.predictor.states import decode_poses, encode_states
 from foretrace.trajectories import mean_distance, rotation_error
 
+FORECASTS = {
+    "mixture": "the predictor's futures",
+    "gaussian": "constant Gaussian, most likely width",
+    "sharp": "constant Gaussian, width of the best CRPS",
+}
+"""Whose samples are scored, in words."""
+SCORES = {
+    "energy_full": "Energy score, whole motion [cm]",
+    "energy_final": "Energy score, final position [cm]",
+    "crps": "CRPS, per coordinate [cm]",
+}
+"""Scores, in words; less is better."""
+WIDTHS = np.geomspace(1e-5, 1.0, 201)
+"""Standard deviations among which that of the best CRPS is sought [m]."""
 SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
 """Levels of the regions that tables tell of."""
 OBSERVED = (0, 10, 15, 20, 25, 30, 40)
@@ -37,7 +57,7 @@ Found = list[tuple[str, str, float, float]]
 
 @dataclass(frozen=True)
 class Part:
-    """Some interactions, as a predictor sees them."""
+    """Some interactions, prepared for a predictor."""
 
     batch: InteractionBatch
     features: Tensor
@@ -51,7 +71,7 @@ class Part:
     def of(cls, predictor: OneShotPredictor, batch: InteractionBatch) -> "Part":
         """As prepared for a predictor."""
         features = predictor.compute_features(predictor.features.inputs(batch))
-        features = predictor.add_known(features, observed_values(batch, predictor.known))
+        features = predictor.add_context(features, recorded_context(batch, predictor.context))
         valid = np.arange(batch.com.shape[1]) < batch.length[:, None]
         return cls(batch, features, encode_states(batch, predictor.state, batch.length), valid)
 
@@ -78,7 +98,7 @@ class Part:
         return predictor.imagine_effects(self.features[rows], self.com[rows, 0], seen)
 
     def mixture(self, predictor: OneShotPredictor) -> Mixture:
-        """What the predictor says before anything was observed."""
+        """The prediction before anything was observed."""
         start = torch.as_tensor(self.com[:, 0], dtype=torch.float32, device=predictor.device)
         with torch.no_grad():
             return predictor.mixture(self.features, start)
@@ -94,37 +114,37 @@ def futures_of(imagined: ImaginedBatch) -> Futures:
     return imagined.futures
 
 
-def judge_outcomes(said: Mapping[str, Float[np.ndarray, " batch"]], truth: np.ndarray) -> Found:
+def evaluate_outcomes(predicted: Mapping[str, Float[np.ndarray, " batch"]], truth: np.ndarray) -> Found:
     """Whether the most probable outcome is what happened.
 
     Args:
-        said: Probability of each outcome.
+        predicted: Probability of each outcome.
         truth: (batch,) names of what happened.
 
     Returns:
         ``confusion``: how often of two outcomes the first happened and the second was most probable. ``f1`` of each
-        outcome that happened or was said, and their mean ``macro_f1``. ``accuracy``, and that of always saying the most
-        common outcome, ``accuracy_of_most_common``. ``brier``: the squared distance of the probabilities from what
-        happened (Brier, 1950), summed over outcomes.
+        outcome that happened or was predicted, and their mean ``macro_f1``. ``accuracy``, and that of always predicting
+        the most common outcome, ``accuracy_of_most_common``. ``brier``: the squared distance of the probabilities from
+        what happened (Brier, 1950), summed over outcomes.
     """
-    names = list(said)
-    best = np.array(names)[np.argmax(list(said.values()), axis=0)]
+    names = list(predicted)
+    best = np.array(names)[np.argmax(list(predicted.values()), axis=0)]
     counts = {(a, b): int(np.sum((truth == a) & (best == b))) for a in names for b in names}
-    found: Found = [("confusion", f"{a}, said {b}", np.nan, float(n)) for (a, b), n in counts.items()]
+    found: Found = [("confusion", f"{a}, predicted {b}", np.nan, float(n)) for (a, b), n in counts.items()]
     f1 = {}
     for name in names:
         hits, happened, claimed = counts[name, name], np.sum(truth == name), np.sum(best == name)
         if happened + claimed:
             f1[name] = 2 * hits / float(happened + claimed)
     found += [("f1", name, np.nan, value) for name, value in f1.items()]
-    brier = sum((probability - (truth == name)) ** 2 for name, probability in said.items())
+    brier = sum((probability - (truth == name)) ** 2 for name, probability in predicted.items())
     common = max(np.mean(truth == name) for name in names)
     overall = {"macro_f1": np.mean(list(f1.values())), "accuracy": np.mean(best == truth)}
     overall |= {"accuracy_of_most_common": common, "brier": np.mean(brier)}
     return found + [(metric, ALL, np.nan, float(value)) for metric, value in overall.items()]
 
 
-def judge_errors(imagined: ImaginedBatch, part: Part) -> Found:
+def evaluate_errors(imagined: ImaginedBatch, part: Part) -> Found:
     """Errors of the most probable future, and of the nearest of those that count.
 
     Returns:
@@ -152,7 +172,7 @@ def judge_errors(imagined: ImaginedBatch, part: Part) -> Found:
     return found + _medians(part, "final_rotation", turned[np.arange(len(part)), part.batch.length - 1])
 
 
-def judge_regions(futures: Futures, part: Part) -> Found:
+def evaluate_regions(futures: Futures, part: Part) -> Found:
     """How often whole motions stay within regions, and how wide these are.
 
     Returns:
@@ -172,12 +192,12 @@ def judge_regions(futures: Futures, part: Part) -> Found:
     return found
 
 
-def judge_observed(predictor: OneShotPredictor, part: Part) -> Found:
+def evaluate_observed(predictor: OneShotPredictor, part: Part) -> Found:
     """Errors of the rest of motions of which the first samples were observed.
 
     Returns:
         For both `BEGINNINGS`, with their names in front: ``rest`` [cm], the mean error of the most probable future over
-        the samples that were not observed; ``rest_unobserved``, of what was said before, over the same samples;
+        the samples that were not observed; ``rest_unobserved``, of the prediction before, over the same samples;
         ``rest_ratio``, the first divided by the second; ``rest_count``, interactions that have a rest; ``macro_f1``.
     """
     unobserved = part.imagine(predictor).com
@@ -203,7 +223,7 @@ def judge_observed(predictor: OneShotPredictor, part: Part) -> Found:
                 values = {"rest": np.mean(after[mine]), "rest_unobserved": np.mean(before[mine])}
                 values |= {"rest_ratio": values["rest"] / values["rest_unobserved"], "rest_count": mine.sum()}
                 found += [(f"{beginning}_{m}", name, float(level), float(v)) for m, v in values.items()]
-            scores = judge_outcomes(outcomes, part.batch.outcome[usable])
+            scores = evaluate_outcomes(outcomes, part.batch.outcome[usable])
             found += [(f"{beginning}_{m}", g, float(level), v) for m, g, _, v in scores if m == "macro_f1"]
     return found
 
@@ -235,3 +255,81 @@ def _known(com: Float[np.ndarray, "batch time 3"], valid: np.ndarray) -> Float[n
 
 def _medians(part: Part, metric: str, values: np.ndarray, level: float = np.nan) -> Found:
     return [(metric, name, level, float(np.median(values[mine]))) for name, mine in part.groups.items()]
+
+
+def constant_deviations(
+    off: Float[np.ndarray, "batch time 3"], valid: Bool[np.ndarray, "batch time"]
+) -> dict[str, Float[np.ndarray, " time"]]:
+    """Standard deviations of coordinates, sample by sample, that fit errors best [m].
+
+    Args:
+        off: Errors of the validation part [m].
+        valid: Which of them count. A sample that none has gets the deviation of the one before.
+
+    Returns:
+        ``gaussian``: the most likely one, the root mean square. ``sharp``: the one with the least mean CRPS, less
+        impressed by a few large errors.
+    """
+    count = valid.sum(axis=0)
+    last = np.maximum.accumulate(np.where(count, np.arange(len(count)), 0))
+    weight = valid / np.maximum(count, 1)
+    square = np.sum(np.where(valid[..., None], off, 0.0) ** 2, axis=2) / 3
+    found = np.empty((len(WIDTHS), len(count)))
+    for each, width in zip(found, WIDTHS, strict=True):
+        crps = scoringrules.crps_normal(np.where(valid[..., None], off, 0.0), 0.0, width, backend="numpy")
+        each[:] = (np.mean(crps, axis=2) * weight).sum(axis=0)
+    likely = np.sqrt((square * weight).sum(axis=0))
+    return {"gaussian": likely[last], "sharp": WIDTHS[found.argmin(axis=0)][last]}
+
+
+def draw(
+    mixture: Mixture,
+    com: Float[np.ndarray, "batch time 3"],
+    deviations: dict[str, Float[np.ndarray, " time"]],
+    num: int,
+    seed: int,
+) -> Iterator[tuple[str, Float[np.ndarray, "batch num time 3"]]]:
+    """Samples of each of `FORECASTS`, by name.
+
+    Args:
+        mixture: The prediction.
+        com: Its most probable motions [m], about which the constant Gaussians lie. Errors grow along a motion and do
+            not jitter: one draw for each coordinate shifts all samples, each by its own deviation.
+        deviations: As from `constant_deviations`.
+        num: Motions for each interaction.
+        seed: Seed of the draw.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    yield "mixture", mixture.sample(num, generator)[..., :3].double().cpu().numpy()
+    z = np.random.default_rng(seed).standard_normal((len(com), num, 1, 3))
+    for name, deviation in deviations.items():
+        yield name, com[:, None] + z * deviation[:, None]
+
+
+def score(
+    drawn: Float[np.ndarray, "batch num time 3"],
+    com: Float[np.ndarray, "batch time 3"],
+    valid: Bool[np.ndarray, "batch time"],
+) -> dict[str, Float[np.ndarray, " batch"]]:
+    """`SCORES` of samples [cm], one number per interaction; the estimates are not biased by the number of samples.
+
+    Args:
+        drawn: Motions drawn at random [m].
+        com: What happened [m].
+        valid: The samples that count. Motions are as far apart as the root mean square over them.
+    """
+    found = {name: np.empty(len(com)) for name in SCORES}
+    for row, (sample, truth, mine) in enumerate(zip(drawn, com, valid, strict=True)):
+        sample, truth = CM * sample[:, mine], CM * truth[mine]  # (num, time, 3), (time, 3)
+        motions, motion = (
+            each / len(truth) ** 0.5 for each in (sample.reshape(len(sample), -1), truth.ravel())
+        )
+        found["energy_full"][row] = _energy(motions, motion)
+        found["energy_final"][row] = _energy(sample[:, -1], truth[-1])
+        crps = scoringrules.crps_ensemble(truth, sample, m_axis=0, estimator="pwm", backend="numpy")
+        found["crps"][row] = np.mean(crps)
+    return found
+
+
+def _energy(sample: Float[np.ndarray, "num dims"], truth: Float[np.ndarray, " dims"]) -> float:
+    return float(np.asarray(scoringrules.es_ensemble(truth, sample, estimator="fair", backend="numpy")))

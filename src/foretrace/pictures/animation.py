@@ -19,8 +19,8 @@ from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, tr
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject
 from foretrace.objects.surface import faces_of
-from foretrace.pictures import scene as figures
-from foretrace.pictures.scene import CM, STYLE, TOOL_REACH, Scene
+from foretrace.pictures.scene import TOOL_REACH, Scene, draw_over_time, legend_of, tool_line
+from foretrace.pictures.style import CM, INK, OBJECT_EDGE, STYLE, SUPPORT_COLOR, TOOL_COLOR
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)
 """Where the camera stands: turned from the action's direction towards its right, and raised."""
@@ -74,10 +74,10 @@ def frames(scene: Scene, width: int = 960, height: int = 450) -> Iterator[np.nda
         stage = fig.add_subplot(grid[:, 0])
         first = fig.add_subplot(grid[0, 1])
         axes = [first, *(fig.add_subplot(grid[k, 1], sharex=first) for k in (1, 2))]
-        figures.draw_over_time(axes, scene)
-        cursors = [ax.axvline(0, color=figures.INK, linewidth=1) for ax in axes]
+        draw_over_time(axes, scene)
+        cursors = [ax.axvline(0, color=INK, linewidth=1) for ax in axes]
         fig.suptitle(scene.title, x=0.015, ha="left", fontsize=12, fontweight="bold")
-        fig.legend(handles=figures.legend_of(scene), loc="lower left", fontsize=8.5)
+        fig.legend(handles=legend_of(scene), loc="lower left", fontsize=8.5)
         limits = _limits(scene)
         for k, time in enumerate(scene.times):
             stage.clear()
@@ -135,15 +135,15 @@ def _draw_stage(ax: Axes, scene: Scene, k: int) -> None:
     if scene.tool is not None:
         tip = pose_to_matrix(scene.tool[k])
         blade = [transform_points(tip, face) for face in _tool_faces()]
-        faces += [(face, _shaded(figures.TOOL_COLOR, face)) for face in blade]
+        faces += [(face, _shaded(TOOL_COLOR, face)) for face in blade]
     faces.sort(key=lambda face: project(face[0])[:, 2].mean())  # the far ones first
     polygons, colors = [project(face)[:, :2] * CM for face, _ in faces], [color for _, color in faces]
-    edges = colors if isinstance(scene.obj, MeshObject) else figures.OBJECT_EDGE  # no triangles on meshes
+    edges = colors if isinstance(scene.obj, MeshObject) else OBJECT_EDGE  # no triangles on meshes
     ax.add_collection(PolyCollection(polygons, facecolors=colors, edgecolors=edges, linewidths=0.9, zorder=2))
     if scene.support_points is not None:
         at_rest = np.column_stack([scene.support_points, np.zeros(2)])
         carried = project(transform_points(pose @ invert_transform(scene.placement), at_rest)) * CM
-        ax.plot(*carried[:, :2].T, color=figures.SUPPORT_COLOR, linewidth=2, marker="o", zorder=3)
+        ax.plot(*carried[:, :2].T, color=SUPPORT_COLOR, linewidth=2, marker="o", zorder=3)
     for _, path, color, style, width in scene.paths():
         faint, so_far = project(path)[:, :2] * CM, project(path[: k + 1])[:, :2] * CM
         ax.plot(*faint.T, color=color, linewidth=1.0, alpha=0.35, zorder=3)
@@ -174,7 +174,7 @@ def _limits(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
     seen = [_table_corners(scene), *(transform_points(pose_to_matrix(pose), faces) for pose in few)]
     seen += [path for _, path, *_ in scene.paths()]
     if scene.tool is not None:
-        seen += [figures.tool_line(pose) for pose in scene.tool[[0, -1]]]
+        seen += [tool_line(pose) for pose in scene.tool[[0, -1]]]
     flat = project(np.concatenate(seen))[:, :2] * CM
     low, high = flat.min(axis=0) - 0.5, flat.max(axis=0) + 0.5
     return (low[0], high[0]), (low[1], high[1])

@@ -1,7 +1,6 @@
 """Pictures of interactions: what was seen, what was done, what happened, and what was imagined.
 
-Nothing here simulates or trains. All is drawn in the action frame: x along the action, y to the left, z up.
-The colours are Okabe and Ito's, which colour-blind readers can tell apart; line styles differ too.
+All is drawn in the action frame: x along the action, y to the left, z up.
 """
 
 from collections.abc import Mapping
@@ -20,53 +19,28 @@ from matplotlib.patches import Patch
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, PredictionError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, transform_points
-from foretrace.interactions.dataset import Dataset
-from foretrace.interactions.record import Interaction, Outcome
+from foretrace.interactions.record import Interaction
 from foretrace.objects import ObjectModel
-from foretrace.pictures.tubes import Outlook
+from foretrace.pictures.bands import PredictionBand
+from foretrace.pictures.style import (
+    CM,
+    DPI,
+    GREY,
+    INK,
+    OBJECT_COLOR,
+    OBJECT_EDGE,
+    PREDICTION_COLORS,
+    PREDICTION_LINES,
+    STYLE,
+    SUPPORT_COLOR,
+    TOOL_COLOR,
+    TRUTH_COLOR,
+)
 
-INK = "#22262e"
-GREY = "#8b93a1"
-TRUTH_COLOR = "#009e73"
-PREDICTION_COLORS = ("#d55e00", "#0072b2", "#cc79a7", "#e69f00")
-PREDICTION_LINES = ("--", "-.", ":", (0, (5, 1, 1, 1)))
-OBJECT_COLOR = "#dde6f0"
-OBJECT_EDGE = "#4a6078"
-TOOL_COLOR = "#6b5b4b"
-SUPPORT_COLOR = "#a3458f"
-OUTCOME_COLORS: dict[str, str] = {
-    Outcome.LEVERED: "#009e73",
-    Outcome.SLIPPED: "#e69f00",
-    Outcome.TUMBLED: "#d55e00",
-    Outcome.ROLLED: "#cc79a7",
-    Outcome.MISSED: "#8b93a1",
-    Outcome.FAILED: "#22262e",
-}
-STYLE: dict[Any, Any] = {
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": GREY,
-    "axes.linewidth": 0.8,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "figure.facecolor": "white",
-}
 TOOL_REACH = 0.12
 """How much of the screwdriver is drawn, from its tip backwards [m]."""
 ARROW_LENGTH = 0.045
 """Length of the arrow that shows the action [m]."""
-CM = 100.0
-DPI = 150
 
 
 class Trace(NamedTuple):
@@ -103,7 +77,7 @@ class Scene:
     """First sample off the blade."""
     title: str = ""
     """What it is, in a line."""
-    outlook: Outlook = field(default_factory=Outlook)
+    band: PredictionBand = field(default_factory=PredictionBand)
     """What else may happen; drawn in the colour of the first prediction."""
 
     @classmethod
@@ -222,13 +196,14 @@ def legend_of(scene: Scene) -> list[Line2D | Patch]:
             mean, final = _errors(scene, path)
             label += f" (mean error {mean:.2f} cm, at the end {final:.2f} cm)"
         handles.append(Line2D([], [], color=color, linestyle=style, linewidth=width, label=label))
-    handles += scene.outlook.handles(PREDICTION_COLORS[0])
+    handles += scene.band.handles(PREDICTION_COLORS[0])
     if scene.support_points is not None:
-        handles.append(_support_handle())
+        handles.append(support_handle())
     return handles
 
 
-def _support_handle() -> Line2D:
+def support_handle() -> Line2D:
+    """Legend entry of the support points."""
     return Line2D([], [], color=SUPPORT_COLOR, marker="o", markersize=5, label="support points")
 
 
@@ -245,7 +220,7 @@ def draw_from_above(ax: Axes, scene: Scene, margin: float = 0.025) -> None:
         ax.plot(path[:, 1] * CM, path[:, 0] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
         ax.plot(path[-1, 1] * CM, path[-1, 0] * CM, color=color, marker="o", markersize=4.5, zorder=5)
     paths = [path[:, :2] for _, path, *_ in scene.paths()]
-    paths.append(scene.outlook.draw_in_plane(ax, [1, 0], PREDICTION_COLORS[0])[:, ::-1])
+    paths.append(scene.band.draw_in_plane(ax, [1, 0], PREDICTION_COLORS[0])[:, ::-1])
     seen = np.concatenate([scene.outline, [[-ARROW_LENGTH, 0]], *paths])
     low, high = (seen.min(axis=0) - margin) * CM, (seen.max(axis=0) + margin) * CM
     ax.set(xlim=(high[1], low[1]), ylim=(low[0], high[0]), aspect="equal", title="From above")
@@ -268,7 +243,7 @@ def draw_from_the_side(ax: Axes, scene: Scene, instants: int = 5) -> None:
     for _, path, color, style, width in scene.paths():
         ax.plot(path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
         ax.plot(path[-1, 0] * CM, path[-1, 2] * CM, color=color, marker="o", markersize=4.5, zorder=5)
-    scene.outlook.draw_in_plane(ax, [0, 2], PREDICTION_COLORS[0])
+    scene.band.draw_in_plane(ax, [0, 2], PREDICTION_COLORS[0])
     (left, right), top = ax.get_xlim(), max(ax.get_ylim()[1], 6.0)
     ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
     ax.axhspan(-50, 0, color="#f1f2f4", zorder=-1)
@@ -285,7 +260,7 @@ def draw_over_time(axes: list[Axes], scene: Scene) -> None:
     for k, (ax, name) in enumerate(zip(axes, ("x", "y", "z"), strict=True)):
         for _, path, color, style, width in scene.paths():
             ax.plot(scene.times_of(path), path[:, k] * CM, color=color, linestyle=style, linewidth=width)
-        scene.outlook.draw_over_time(ax, scene.times_of(scene.outlook.path), k, PREDICTION_COLORS[0])
+        scene.band.draw_over_time(ax, scene.times_of(scene.band.path), k, PREDICTION_COLORS[0])
         if scene.slip_index is not None and scene.slip_index < len(scene.times):
             ax.axvline(scene.times[scene.slip_index], color=GREY, linestyle=":", linewidth=1.2)
             if k == 0:
@@ -318,58 +293,6 @@ def tool_line(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2 3"]:
     return transform_points(pose_to_matrix(pose), np.array([[0.0, 0, 0], [-TOOL_REACH, 0, 0]]))
 
 
-def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
-    """Many interactions from above at one scale: outline, action, support points and path by outcome.
-
-    Args:
-        dataset: What to show; if it is larger than the sheet, it is sampled evenly.
-        columns: Pictures side by side.
-        rows: Pictures one above another.
-
-    Raises:
-        DatasetError: There is nothing to show.
-    """
-    if len(dataset) == 0:
-        raise DatasetError(f"{dataset.path} has no interaction to show: filter less, or simulate")
-    shown = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), columns * rows)).round().astype(int))
-    columns = min(columns, len(shown))
-    rows = -(-len(shown) // columns)
-    counts = dataset.outcomes()
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(1.55 * columns + 0.3, 1.7 * rows + 1.0), dpi=DPI, layout="constrained")
-        for cell, k in enumerate(shown):
-            _draw_cell(fig.add_subplot(rows, columns, cell + 1), dataset[int(k)])
-        title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
-        fig.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        handles = [
-            Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
-            for name, count in counts.items()
-        ]
-        handles.append(_support_handle())
-        fig.legend(handles=handles, loc="outside lower center", ncols=8)
-    return fig
-
-
-def _draw_cell(ax: Axes, interaction: Interaction) -> None:
-    """A stamp-sized view from above, the same scale for all."""
-    effect = interaction.effect
-    color = OUTCOME_COLORS[effect.outcome]
-    placement = interaction.action.T_action_object
-    outline = (interaction.object.corners @ placement[:2, :2].T + placement[:2, 3]) * CM
-    ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=0.9)
-    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 1.5, "shrinkA": 0, "shrinkB": 0}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
-    points = effect.support_points * CM
-    ax.plot(points[:, 1], points[:, 0], color=SUPPORT_COLOR, linewidth=1.5, marker="o", markersize=3)
-    path = effect.com_trajectory * CM
-    ax.plot(path[:, 1], path[:, 0], color=color, linewidth=2.2)
-    middle = (outline[:, 1].min() + outline[:, 1].max()) / 2
-    ax.plot([middle + 10.5, middle + 0.5], [-6.5, -6.5], color=GREY, linewidth=1.5)
-    ax.set(xlim=(middle + 11, middle - 11), ylim=(-7, 21), aspect="equal")
-    ax.axis("off")
-    ax.set_title(f"{interaction.id}  {effect.outcome}", fontsize=8, color=INK, fontweight="normal", pad=2)
-
-
 def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
     """Several lever-ups side by side, each from above and from the side, imagined beside observed.
 
@@ -392,7 +315,7 @@ def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
             Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
             for name, _, color, style, width in next(iter(scenes.values())).paths()
         ]
-        fig.legend(handles=[*handles, _support_handle()], loc="outside lower center", ncols=4)
+        fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=4)
     return fig
 
 

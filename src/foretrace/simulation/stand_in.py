@@ -180,6 +180,15 @@ class StandIn:
             physics=physics,
         )
 
+    def see(self, obj: Prism, action: LeverUp, perturbation: Perturbation) -> TopDownView:
+        """The view that `observe` reports, without playing the lever-up.
+
+        Raises:
+            ViewError: The object does not fit in the view.
+        """
+        real = Prism(obj.corners, obj.height + perturbation.thickness_error, obj.bevel)
+        return self._see(real, action, perturbation, np.random.default_rng(perturbation.noise_seed))
+
     def _see(
         self, real: Prism, action: LeverUp, drawn: Perturbation, rng: np.random.Generator
     ) -> TopDownView:
