@@ -155,7 +155,7 @@ def predict(
         animation: Write an animation as well.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
     """
-    from foretrace.cli.futures import outlook_of, radius_of, say_futures
+    from foretrace.cli.futures import prediction_band, radius_of, say_futures
     from foretrace.interactions.recording_folder import write_image
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.scene import Scene, scene_figure
@@ -183,7 +183,7 @@ def predict(
         scene = replace(Scene.observed(truth, paths), title=title)
     else:
         scene = Scene.imagined(object, action, imagined.times, paths)
-    scene = replace(scene, outlook=outlook_of(imagined))
+    scene = replace(scene, band=prediction_band(imagined))
     say_futures(imagined)
     out.mkdir(parents=True, exist_ok=True)
     _write_trajectory(out, run, object, action, imagined, truth)
