@@ -39,9 +39,8 @@ figures: setup
 # The predictor that comes with the package: some 20 minutes on two cores.
 checkpoint: setup
 	$(BIN)/foretrace simulate --recipe everyday --randomise --objects 800 --seed 3 --out data/default
-	$(BIN)/foretrace train --data data/default --predictor one-shot --heights --hidden 192 --motions 64 --epochs 100 \
-		--outcomes levered slipped tumbled rolled missed --split 6400 600 560 --threads 1 --out runs/default
-	$(BIN)/foretrace card runs/default --data data/default
+	$(BIN)/foretrace train --data data/default --predictor one-shot --heights --hidden 192 --components 64 --epochs 100 \
+		--outcomes levered slipped tumbled rolled missed --split 6400 600 560 --threads 1 --out runs/default --card
 	cp runs/default/config.json runs/default/model.safetensors runs/default/MODEL_CARD.md \
 		src/foretrace/predictor/default
 

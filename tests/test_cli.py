@@ -1,8 +1,11 @@
+import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -63,7 +66,7 @@ def test_an_error_is_one_line_and_exit_status_2(folder, capsys):
     assert printed.err.startswith("foretrace: error: ")
     assert printed.err.count("\n") == 1
     assert "objects = 8" in printed.err
-    assert cli.main(["doctor", str(folder / "nowhere")]) == 2
+    assert cli.main(["data", str(folder / "nowhere")]) == 2
     assert "no data set at" in capsys.readouterr().err
 
 
@@ -74,7 +77,7 @@ def test_simulate_takes_recipes_and_watches_solids_longer(fake_physics, tmp_path
     assert configuration["recipe"] == "mixed"
     assert configuration["simulation"]["watch_time"] == 1.5
     assert configuration["simulation"]["physics"]["table_edge"] == 0.3
-    assert cli.main(["describe", str(tmp_path / "mixed")]) == 0
+    assert cli.main(["data", str(tmp_path / "mixed")]) == 0
     assert "cylinder: 8 levered" in capsys.readouterr().out
     assert cli.main([*begun, str(tmp_path / "paper")]) == 0
     assert storage.read_manifest(tmp_path / "paper")["configuration"]["simulation"]["watch_time"] == 0
@@ -85,17 +88,17 @@ def test_simulate_takes_recipes_and_watches_solids_longer(fake_physics, tmp_path
 
 
 def test_doctor_finds_repairs_and_tells_by_its_exit_status(folder, capsys):
-    assert cli.main(["doctor", str(folder)]) == 0
+    assert cli.main(["data", str(folder)]) == 0
     assert "104 interactions, no problems left" in capsys.readouterr().out
     (folder / storage.shard_name(1)).write_bytes(b"not parquet")
-    assert cli.main(["doctor", str(folder)]) == 1
+    assert cli.main(["data", str(folder)]) == 1
     assert f"found: {storage.shard_name(1)}: shard" in capsys.readouterr().out
-    assert cli.main(["doctor", str(folder), "--repair"]) == 1
+    assert cli.main(["data", str(folder), "--repair"]) == 1
     printed = capsys.readouterr().out
     assert "repaired: " in printed
     assert "100 interactions, 1 problem left" in printed
     assert cli.main(["simulate", "--out", str(folder), "--objects", "8", "--workers", "1"]) == 0
-    assert cli.main(["doctor", str(folder)]) == 0
+    assert cli.main(["data", str(folder)]) == 0
 
 
 def test_a_warning_is_one_line(folder, capsys):
@@ -191,21 +194,82 @@ def test_evaluate_paper_refuses_in_one_line(options, message, folder, tmp_path, 
     assert not (tmp_path / "results").exists()
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["simulate", "--help"], ["doctor", "--help"], ["evaluate", "paper", "--help"]]
-)
-def test_help_names_the_options(arguments, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        cli.main(arguments)
-    assert stopped.value.code == 0
+def all_commands(entries: Mapping[str, cli.Entry] = cli.COMMANDS, above: tuple[str, ...] = ()):
+    """Words of every command and of every group of them."""
+    yield above
+    for name, entry in entries.items():
+        yield from (
+            all_commands(entry.members, (*above, name)) if isinstance(entry, cli.Group) else [(*above, name)]
+        )
+
+
+VARIANTS = [("train", "--predictor", "one-shot"), ("train", "--features", "ae-256")]
+
+
+@pytest.mark.parametrize("words", [*all_commands(), *VARIANTS], ids=" ".join)
+def test_help_is_plain_and_fits_a_narrow_terminal(words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with contextlib.suppress(SystemExit):
+        assert cli.main([*words, "--help"]) == 0
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert usage.startswith(f"usage: foretrace {' '.join(words[:1])}".rstrip())
+    assert max(map(len, lines)) <= 80
+    text = " ".join(lines)
+    for odd in ("{None}", "None|", "|None", "(default: None)", "(default: )", "``", "Args:", "partial("):
+        assert odd not in text, odd
+    # An option without a word about it is told from its neighbour by what follows on its line or the next one.
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+        if line.startswith("│ --"):
+            bare = re.fullmatch(r"│ (--\S+)( [A-Z{][^a-z]*| \{\S+\})? *│", line) is not None
+            assert not bare or not following.startswith("│ --"), line
+
+
+def test_the_list_of_commands_has_a_line_for_each(capsys):
+    assert cli.main(["--help"]) == 0
     printed = capsys.readouterr().out
-    assert ("simulate" if arguments == ["--help"] else "--") in printed
+    listed = re.findall(r"^  (\S+) +\S.*$", printed, re.MULTILINE)
+    assert listed == list(cli.COMMANDS)
+    assert len(listed) == 14
+    assert cli.main([]) == 2
 
 
-def test_an_unknown_command_is_refused(capsys):
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["levitate"], "unknown command 'levitate': choose from demo, simulate, data, train"),
+        (["simulat"], "unknown command 'simulat': did you mean simulate?"),
+        (["export", "rosbags"], "did you mean rosbag?"),
+        (["train", "--predictor", "gru"], "unknown predictor 'gru'; available: lstm, one-shot"),
+        (["train", "--data", "d", "--out", "o", "--epochs", "0"], "epochs is 0"),
+        (["simulate", "--out", "o", "--density", "1e-30"], "density = 1e-30"),
+    ],
+)
+def test_what_does_not_exist_is_refused_in_one_line(words, message, capsys):
+    assert cli.main(words) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["simulate"],
+        ["simulate", "--out", "o", "--objects", "many"],
+        ["train", "--data", "d", "--out", "o", "--predictor", "one-shot", "--state", "pose"],
+        ["train", "--data", "d", "--out", "o", "--predictor", "one-shot", "--steps-ahead", "2"],
+        ["train", "--data", "d", "--out", "o", "--components", "8"],
+        ["train", "--data", "d", "--out", "o", "--heights"],
+    ],
+)
+def test_options_that_a_command_does_not_have_are_refused(words, capsys):
     with pytest.raises(SystemExit) as stopped:
-        cli.main(["levitate"])
+        cli.main(words)
     assert stopped.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "foretrace" in printed.err
 
 
 def test_help_imports_nothing_slow():
@@ -246,7 +310,7 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence(printing):
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.parametrize("command", ["describe --out", "show --id 3 --out"])
+@pytest.mark.parametrize("command", ["data --out", "show --id 3 --out"])
 def test_a_file_in_the_way_of_an_output_is_told_in_one_line(command, folder, tmp_path, capsys):
     name, *options = command.split()
     (tmp_path / "file").write_text("kept")
@@ -281,18 +345,10 @@ def group_lives(group: int) -> bool:
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_keeps_what_is_done_and_says_how_to_go_on(tmp_path, sent):
-    command = [
-        sys.executable,
-        "-m",
-        "foretrace",
-        "simulate",
-        "--out",
-        str(tmp_path / "data"),
-        "--workers",
-        "2",
-    ]
+    fast = ["--embodiment", "tool", "--insert-time", "0.1", "--lift-time", "0.2", "--hold-time", "0"]
+    command = [sys.executable, "-m", "foretrace", "simulate", "--out", str(tmp_path / "data"), *fast]
     process = subprocess.Popen(
-        [*command, "--embodiment", "tool"],
+        [*command, "--workers", "2"],
         env=environment(),
         stderr=subprocess.PIPE,
         text=True,

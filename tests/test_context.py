@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from factories import fake_batch
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.cli import main
-from foretrace.cli.learning import _told_values
+from foretrace.cli.prediction import _given_context
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
 from foretrace.imagined.context import PARAMETERS, nominal_parameters, true_context
@@ -208,8 +208,8 @@ def test_a_checkpoint_with_nonsense_for_context_is_refused(tmp_path, run):
 )
 def test_options_of_predict_are_checked(given, knows, simulated, message):
     with pytest.raises(PredictionError, match=message):
-        _told_values(given, knows, simulated)
-    assert _told_values({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
+        _given_context(given, knows, simulated)
+    assert _given_context({"friction": 0.7, "density": None}, (), True) == {"friction": 0.7}
 
 
 def test_the_actions_parameters_are_context_as_constants_are(batch):

@@ -46,7 +46,7 @@ def run(data: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def card(run: Path, data: Path) -> str:
-    assert cli.main(["card", str(run), "--data", str(data)]) == 0
+    assert cli.main(["train", "--data", str(data), "--out", str(run), "--card"]) == 0
     return (run / "MODEL_CARD.md").read_text()
 
 
@@ -234,5 +234,5 @@ def test_a_card_needs_the_data_of_the_run(run: Path, tmp_path: Path, capsys) -> 
     other = write_data(
         tmp_path / "data", factories.fake_interactions(np.random.default_rng(1), 4, num_samples=SAMPLES)
     )
-    assert cli.main(["card", str(run), "--data", str(other)]) == 2
+    assert cli.main(["train", "--data", str(other), "--out", str(run), "--card"]) == 2
     assert "give the data set that it was trained on" in capsys.readouterr().err

@@ -8,6 +8,10 @@ class ForetraceError(Exception):
     """Base of every error that foretrace raises on purpose."""
 
 
+class CommandError(ForetraceError):
+    """A command that does not exist, or whose options do not go together."""
+
+
 class ShapeError(ForetraceError):
     """An object's geometry cannot be used: too few corners, self-intersection, not watertight, absurd size."""
 

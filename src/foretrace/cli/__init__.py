@@ -1,8 +1,7 @@
 """The command line: ``foretrace simulate | train | predict | ...``.
 
-A command is a function of plain arguments in `COMMANDS`, or a `Group` of such; tyro makes the options from its
-signature and the help from its docstring. Whatever is slow to import is imported inside, so that
-``foretrace --help`` answers at once.
+A command is a function; `COMMANDS` has one line about each, and where it is. It is imported when it is asked for, so
+that ``foretrace --help`` answers at once; how its options come from its signature is in `foretrace.cli.parsing`.
 """
 
 import os
@@ -10,64 +9,50 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, Union
-
-import tyro
+from collections.abc import Sequence
 
 import foretrace
-from foretrace.cli.calibrate import calibrate
-from foretrace.cli.capture import capture
-from foretrace.cli.card import card
 from foretrace.cli.console import say
-from foretrace.cli.data import describe, doctor, show, simulate
-from foretrace.cli.demo import demo
-from foretrace.cli.evaluation import experiment_commands
-from foretrace.cli.export import export_lerobot, export_onnx, export_rerun, export_rosbag
-from foretrace.cli.film import film
-from foretrace.cli.learning import predict, train
-from foretrace.cli.overlay import overlay
-from foretrace.cli.recordings import import_recording
-from foretrace.cli.robot import robot
+from foretrace.cli.parsing import Command, Entry, Group, Ready, parse
 from foretrace.errors import ForetraceError
 
-Command = Callable[..., int | None]
+LEARN, SEE, HAND_ON = "simulate, learn, predict", "cameras and recordings", "other programs and robots"
+"""Headings of the list of commands."""
 
 
-@dataclass(frozen=True)
-class Group:
-    """Several commands under one name."""
-
-    summary: str
-    """What they have in common, in a line."""
-    commands: Mapping[str, Command]
-    """Each by its name within the group."""
+def _command(home: str, summary: str, section: str = "", varies: bool = False) -> Command:
+    return Command(summary, f"foretrace.cli.{home}", section, varies)
 
 
-EVALUATE = "Run an experiment, or go on with it: rows, summary, report and figures."
-COMMANDS: dict[str, Command | Group] = {
-    "demo": demo,
-    "simulate": simulate,
-    "train": train,
-    "evaluate": Group(EVALUATE, experiment_commands()),
-    "card": card,
-    "predict": predict,
-    "export": Group(
-        "Interactions, and what a predictor imagines about them, for ROS, Rerun and LeRobot; predictors for ONNX.",
-        {"rosbag": export_rosbag, "rerun": export_rerun, "lerobot": export_lerobot, "onnx": export_onnx},
-    ),
-    "show": show,
-    "describe": describe,
-    "doctor": doctor,
-    "calibrate": calibrate,
-    "capture": capture,
-    "film": film,
-    "import": import_recording,
-    "overlay": overlay,
-    "robot": robot,
+def _experiments() -> dict[str, Command]:
+    from foretrace.cli.evaluation import experiment_commands
+
+    return experiment_commands()
+
+
+EXPORTS: dict[str, Entry] = {
+    "rosbag": _command("export:export_rosbag", "Interactions as bags of ROS 1 or ROS 2."),
+    "rerun": _command("export:export_rerun", "Interactions as Rerun recordings."),
+    "lerobot": _command("export:export_lerobot", "Interactions as one LeRobotDataset."),
+    "onnx": _command("export:export_onnx", "The network of a predictor as ONNX."),
 }
-"""Every command by its name."""
+COMMANDS: dict[str, Entry] = {
+    "demo": _command("demo:demo", "Simulate, train, predict and compare in a few minutes.", LEARN),
+    "simulate": _command("simulation:simulate", "Simulate lever-ups of many objects into a data set.", LEARN),
+    "data": _command("data:data", "Describe, check, repair or upgrade a data set.", LEARN),
+    "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
+    "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
+    "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
+    "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
+    "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or write its calibration board.", SEE),
+    "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),
+    "film": _command("film:film", "Render a recording of a simulated lever-up.", SEE),
+    "capture": _command("capture:capture", "Record with a RealSense camera (experimental).", SEE),
+    "overlay": _command("overlay:overlay", "Draw prediction and observation over a recording.", SEE),
+    "export": Group("Write data for ROS, Rerun, LeRobot; predictors for ONNX.", EXPORTS, HAND_ON),
+    "robot": _command("robot:robot", "Check and execute a lever-up on a UR10 (experimental).", HAND_ON),
+}
+"""Every command by its name, in the order of the help."""
 
 
 INTERRUPTED = 130
@@ -79,7 +64,7 @@ OUTPUT_CLOSED = 141
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done. 1: `doctor` has something left to mend, or trials of `evaluate` failed. 2: an error, printed as
+    0: done. 1: `data` has something left to mend, or a trial of `evaluate` failed. 2: an error, printed as
     one line. 130: interrupted. 141: the output was closed.
     """
     if threading.current_thread() is threading.main_thread():
@@ -102,6 +87,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise
 
 
+def read(arguments: Sequence[str]) -> Ready:
+    """The command that arguments ask for, ready to run.
+
+    Raises:
+        ForetraceError: There is no such command, or its options do not go together.
+        SystemExit: Help was asked for and has been printed; or the options cannot be read.
+    """
+    about = "Predict how an object will move before the robot touches it."
+    return parse(COMMANDS, arguments, "foretrace", about)
+
+
 def _run(arguments: Sequence[str]) -> int:
     """One command; its errors are told in one line."""
     if list(arguments) == ["--version"]:
@@ -110,13 +106,7 @@ def _run(arguments: Sequence[str]) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
         try:
-            named = arguments[1:2] if list(arguments[:1]) == ["evaluate"] else ()
-            status = tyro.cli(
-                _choice(COMMANDS | {"evaluate": Group(EVALUATE, experiment_commands(named))}),
-                prog="foretrace",
-                description="Predict how an object will move before the robot touches it.",
-                args=arguments,
-            )
+            status = read(arguments)()
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -140,17 +130,3 @@ def _run(arguments: Sequence[str]) -> int:
 def _refuse(reason: str) -> int:
     say(f"error: {' '.join(reason.split())}")
     return 2
-
-
-def _choice(commands: Mapping[str, Command | Group]) -> Any:
-    """One of several commands, as a type that tyro understands."""
-    known = []
-    for name, command in commands.items():
-        if isinstance(command, Group):
-            nested = tyro.conf.subcommand(
-                name, constructor=_choice(command.commands), description=command.summary
-            )
-            known.append(Annotated[Any, nested])
-        else:
-            known.append(Annotated[Any, tyro.conf.subcommand(name, constructor=command)])
-    return Union[tuple(known)]  # noqa: UP007

@@ -1,18 +1,21 @@
 """The command that calibrates a camera."""
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
+from foretrace.errors import PerceptionError
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.calibration import Board, read_images, refine_camera
+from foretrace.perception.calibration import calibrate as calibrate_camera
+from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
 
 
 def calibrate(
+    board: Annotated[OmitArgPrefixes[Board], arg(name="board")],
     images: Positional[tuple[Path, ...]] = (),
-    squares: tuple[int, int] = (7, 5),
-    square_length: float = 0.035,
-    marker_length: float = 0.026,
-    dictionary: str = "5x5_100",
     out: Path = Path("camera.json"),
     print_board: Path | None = None,
     refine: Path | None = None,
@@ -23,21 +26,13 @@ def calibrate(
     With --refine, a camera file that does not quite fit its images is adjusted by markers of known size instead.
 
     Args:
+        board: The board, as measured on the print.
         images: Images or folders of images: 10 to 20 of the board, slanted, near and far, also in the corners.
-        squares: Squares of the board along x and y.
-        square_length: Side of a square, measured on the print [m].
-        marker_length: Side of a marker [m].
-        dictionary: Dictionary of its markers.
         out: File for the camera.
         print_board: Write the board to this .png or .pdf file instead.
         refine: Camera file whose focal lengths and first radial distortion are adjusted to the images.
         markers: Marker layout, of which the table's markers are in the images, seen from several sides.
     """
-    from foretrace.errors import PerceptionError
-    from foretrace.perception.calibration import Board, read_images
-    from foretrace.perception.calibration import calibrate as calibrate_camera
-
-    board = Board(squares, square_length, marker_length, dictionary)
     if print_board is not None:
         board.save(print_board)
         width, height = (1000 * length for length in board.size)
@@ -67,9 +62,7 @@ def calibrate(
 
 def _refine(images: tuple[Path, ...], stated: Path, markers: Path, out: Path) -> None:
     """Adjust a camera file to images of the table's markers."""
-    from foretrace.interactions.pinhole import PinholeCamera
-    from foretrace.perception.calibration import read_images, refine_camera
-    from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
+    from foretrace.perception.calibration import read_images
 
     layout = MarkerLayout.load(markers)
     name = layout.dictionary

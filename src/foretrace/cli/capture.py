@@ -1,21 +1,28 @@
 """The command that records with a RealSense camera."""
 
+import signal
+import threading
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+import numpy as np
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
+from foretrace.cli.parsing import adapt
+from foretrace.errors import PerceptionError
+from foretrace.interactions import recording_folder
+from foretrace.interactions.recording_folder import RecordingNotes, write_recording
+from foretrace.perception.realsense import CaptureConfig, LiveCamera
 
 
+@adapt(frames_per_second="fps")
 def capture(
     out: Positional[Path],
+    config: Annotated[OmitArgPrefixes[CaptureConfig], arg(name="")],
     seconds: float = 8.0,
     background: bool = False,
-    width: int = 1280,
-    height: int = 720,
-    fps: int = 30,
-    depth_every: int = 10,
-    serial: str | None = None,
 ) -> None:
     """Record with a RealSense camera into a folder that `import` reads (experimental).
 
@@ -24,24 +31,10 @@ def capture(
 
     Args:
         out: Folder for the recording.
-        seconds: How long to record [s].
+        config: Settings of the camera.
+        seconds: Duration of the recording [s].
         background: Take an image of the empty table instead: the mean of half a second.
-        width: Columns of the images.
-        height: Rows of the images.
-        fps: Frames per second.
-        depth_every: Images from one with aligned depth to the next; 0: no depth.
-        serial: Serial number of the camera, if there are several.
     """
-    import signal
-    import threading
-
-    import numpy as np
-
-    from foretrace.errors import PerceptionError
-    from foretrace.interactions import recording_folder
-    from foretrace.interactions.recording_folder import RecordingNotes, write_recording
-    from foretrace.perception.realsense import CaptureConfig, LiveCamera
-
     if not 0 < seconds < float("inf"):
         raise PerceptionError(
             f"--seconds is {seconds}: give a number above 0; Ctrl-C ends the recording earlier"
@@ -50,7 +43,7 @@ def capture(
     if taken.exists():
         raise PerceptionError(f"{taken} is there already: choose another folder")
     out.mkdir(parents=True, exist_ok=True)
-    with LiveCamera(CaptureConfig(width, height, fps, 0 if background else depth_every, serial)) as camera:
+    with LiveCamera(replace(config, depth_every=0) if background else config) as camera:
         if background:
             images = [frame.image for frame in camera.frames(lambda time: time > 0.5)]
             recording_folder.write_image(taken, np.rint(np.mean(images, axis=0)).astype(np.uint8))

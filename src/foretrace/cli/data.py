@@ -1,107 +1,63 @@
-"""Commands about data sets: simulate, doctor, show, describe."""
+"""Commands about data sets: data, show."""
 
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
-from foretrace.cli.console import say
+from foretrace.cli.console import print_outcomes
 from foretrace.errors import DatasetError
 
-ROLLING_TIME = 1.5
-"""How long solids are watched after the blade has stopped [s]: most have rolled more than their length by then."""
 
+def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, out: Path | None = None) -> int:
+    """Describe a data set and check it: checksums, schema, numbers, ids.
 
-def simulate(
-    out: Path,
-    objects: int = 160,
-    contacts_per_edge: int = 2,
-    engine: str = "mujoco",
-    embodiment: Literal["arm", "tool"] = "arm",
-    camera: Literal["exact", "rgbd"] = "exact",
-    seed: int = 0,
-    workers: int | None = None,
-    recipe: Literal["paper", "solids", "mixed", "everyday"] = "paper",
-    watch_time: float | None = None,
-    table_edge: float | None = None,
-    randomise: bool = False,
-    vary_action: bool = False,
-) -> None:
-    """Simulate lever-ups of many objects into a data set.
-
-    The same command goes on where an interrupted one stopped. The same seed gives the same data, however many
-    workers there are.
-
-    Args:
-        out: Folder of the data set.
-        objects: Number of objects; prisms are spread evenly over 3 to 10 corners.
-        contacts_per_edge: Lever-ups at each edge of each object; round outlines have as many as four edges.
-        engine: Physics engine.
-        embodiment: The whole robot, or the blade alone on the same path (faster).
-        camera: How the view from above is made: from geometry, or from a rendered depth image.
-        seed: Seed of objects, contact points and simulations.
-        workers: Processes; by default one for each core.
-        recipe: Which objects. paper: prisms. solids: lying cylinders, boxes and flat prisms, always three with one
-            outline. mixed: prisms and solids. everyday: the same with prisms of many sizes, and flat objects with
-            round, organic and dented outlines.
-        watch_time: Seconds to go on watching after the blade has stopped; by default 0 for the paper's prisms,
-            and 1.5 otherwise, since solids may roll.
-        table_edge: Distance of the table's edge ahead of the contact point, in metres: objects can fall off. By
-            default no edge is within reach.
-        randomise: Draw friction, density, thickness and bevel anew for every lever-up, and let the blade err in
-            place and direction. Objects, contact points and what is told of them stay the same.
-        vary_action: Draw how deep the blade goes, on what arc it lifts and how fast anew for every lever-up.
-    """
-    from dataclasses import replace
-
-    from foretrace.interactions.record import Physics
-    from foretrace.simulation.collect import CollectConfig, collect
-    from foretrace.simulation.lever_up import SimulationConfig
-    from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION
-
-    if watch_time is None:
-        watch_time = 0.0 if recipe == "paper" else ROLLING_TIME
-    simulation = SimulationConfig(
-        engine=engine,
-        embodiment=embodiment,
-        camera=camera,
-        watch_time=watch_time,
-        physics=Physics(table_edge=table_edge),
-    )
-    randomisation = RANDOMISED if randomise else NOTHING
-    if vary_action:
-        randomisation = replace(randomisation, **VARIED_ACTION)
-    config = CollectConfig(objects, contacts_per_edge, seed, simulation, recipe, randomisation)
-    try:
-        counts = collect(config, out, workers)
-    except KeyboardInterrupt:
-        say(f"interrupted; what is done stays in {out}, the same command goes on from there")
-        raise
-    _print_outcomes(counts)
-    print(f"data set: {out}")
-
-
-def doctor(path: Positional[Path], repair: bool = False, upgrade: bool = False) -> int:
-    """Check a data set: checksums, schema, numbers, ids. The exit status is 1 if something is left to mend.
+    Outcomes, how far objects were lifted, what varies, and everything that is wrong. The exit status is 1 if something
+    is left to mend.
 
     Args:
         path: Folder of the data set.
         repair: Remove leftovers, set corrupt shards aside (`foretrace simulate` makes them again), and enter
             whole shards that miss their checksum.
         upgrade: Bring a data set of format version 1 to today's format first, in place.
+        out: JSON file for the description.
     """
+    from foretrace.files import write_json
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.interactions.description import describe_dataset
     from foretrace.interactions.doctor import examine
     from foretrace.interactions.upgrade import upgrade as upgrade_in_place
 
     if upgrade:
         print(f"{path}: {upgrade_in_place(path) or 'no'} interactions upgraded")
     diagnosis = examine(path, repair)
+    left = sum(not finding.repaired for finding in diagnosis.findings)
+    try:
+        description = describe_dataset(Dataset.open(path))
+    except DatasetError:
+        if not left:
+            raise
+        print_outcomes(diagnosis.outcomes)
+    else:
+        _print_description(description)
+        if out is not None:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            write_json(out, description, indent=2)
     for finding in diagnosis.findings:
         print(f"{'repaired' if finding.repaired else 'found'}: {finding.file}: {finding.problem}")
-    left = sum(not finding.repaired for finding in diagnosis.findings)
-    _print_outcomes(diagnosis.outcomes)
     print(f"{path}: {diagnosis.num_interactions} interactions, {left or 'no'} problem{'s'[: left != 1]} left")
     return int(left > 0)
+
+
+def _print_description(description: dict) -> None:
+    print_outcomes(description["outcomes"])
+    if len(kinds := description["outcomes_by_kind"]) > 1:
+        for kind, counts in kinds.items():
+            print(f"{kind:>10}: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    for name, (low, high) in description["varies"].items():
+        print(f"{name.replace('_', ' '):>42} {low:10.4g} to {high:.4g}")
+    for name, value in description.items():
+        if not isinstance(value, dict) and name != "interactions":
+            print(f"{name.replace('_', ' '):>42} {value:10.4g}")
 
 
 def show(path: Positional[Path], id: int | None = None, out: Path | None = None) -> None:
@@ -109,9 +65,9 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
 
     Args:
         path: Folder of the data set.
-        id: The interaction to draw; without it, the contact sheet is drawn.
-        out: File to write (.png, .svg, .pdf; with an id also .gif, .mp4). By default pictures go to the
-            folder's ``figures``.
+        id: Number of the interaction to draw; without it, the contact sheet is drawn.
+        out: File to write: .png, .svg or .pdf; with an id also .gif or .mp4. By default pictures go to the
+            data set's folder figures.
     """
     from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import interaction_animation
@@ -137,37 +93,3 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
             figure = contact_sheet(dataset) if id is None else interaction_figure(dataset.with_id(id))
             figure.savefig(target)
         print(target)
-
-
-def describe(path: Positional[Path], out: Path | None = None) -> None:
-    """Describe a data set: outcomes, how far objects were lifted, and what they stood on.
-
-    Args:
-        path: Folder of the data set.
-        out: JSON file to write the figures to.
-    """
-    import json
-
-    from foretrace.interactions.dataset import Dataset
-    from foretrace.interactions.description import describe_dataset
-
-    figures = describe_dataset(Dataset.open(path))
-    _print_outcomes(figures["outcomes"])
-    if len(kinds := figures["outcomes_by_kind"]) > 1:
-        for kind, counts in kinds.items():
-            print(f"{kind:>10}: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
-    for name, (low, high) in figures["varies"].items():
-        print(f"{name.replace('_', ' '):>42} {low:10.4g} to {high:.4g}")
-    for name, value in figures.items():
-        if not isinstance(value, dict) and name != "interactions":
-            print(f"{name.replace('_', ' '):>42} {value:10.4g}")
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(figures, indent=2) + "\n")
-
-
-def _print_outcomes(counts: dict[str, int]) -> None:
-    total = sum(counts.values())
-    for outcome, count in counts.items():
-        print(f"{outcome:>10} {count:7d} {100 * count / total:6.1f} %")
-    print(f"{'total':>10} {total:7d}")

@@ -4,6 +4,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from foretrace.cli.console import print_report
+
 if TYPE_CHECKING:
     from foretrace.interactions.record import Interaction
     from foretrace.interactions.topdown import TopDownView
@@ -19,15 +21,23 @@ HELD_OUT_CORNERS = (4, 6, 9)
 
 
 def demo(
-    out: Path = Path("demo"), objects: int = 48, epochs: int = 20, workers: int | None = None, seed: int = 0
+    out: Path = Path("demo"),
+    objects: int = 48,
+    contacts_per_edge: int = 2,
+    epochs: int = 20,
+    min_steps: int = 300,
+    workers: int | None = None,
+    seed: int = 0,
 ) -> None:
     """Simulate lever-ups, learn from them, and predict new shapes and a real object's silhouette.
 
     Args:
         out: Folder for data, trainings and pictures; the same command goes on where an interrupted one stopped.
-        objects: Objects to learn from; the paper has 160.
+        objects: Number of objects to learn from; the paper has 160.
+        contacts_per_edge: Lever-ups at each of their edges.
         epochs: Passes over the training part.
-        workers: Processes that simulate; by default one for each core.
+        min_steps: Optimiser steps, at least: little data are passed over more often.
+        workers: Number of processes that simulate; by default one for each core.
         seed: Seed of everything.
     """
     from rich.console import Console
@@ -43,9 +53,9 @@ def demo(
 
     started = time.monotonic()
     # One thread: two on a core that something else uses would be many times slower.
-    config = TrainConfig(epochs=epochs, split=None, seed=seed, threads=1)
+    config = TrainConfig(epochs=epochs, min_steps=min_steps, split=None, seed=seed, threads=1)
     print(f"1. Simulating lever-ups of {objects} objects with a UR10 and a screwdriver")
-    counts = collect(CollectConfig(objects=objects, seed=seed), out / "data", workers)
+    counts = collect(CollectConfig(objects, contacts_per_edge, seed), out / "data", workers)
     print("   " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     dataset = Dataset.open(out / "data")
     contact_sheet(dataset).savefig(out / "interactions.png")
@@ -55,7 +65,7 @@ def demo(
         print(f"2. Training the LSTM with {name}")
         run = train_predictor(dataset, LstmConfig(features=label), out / "runs" / label, config)
         predictors[name] = load_predictor(run)
-        print(run_experiment(Predictor(run, out / "data"), console=Console(quiet=True)).report)
+        print_report(run_experiment(Predictor(run, out / "data"), console=Console(quiet=True)).report)
 
     print("3. Predicting shapes and an object that were not in the data, and simulating them")
     shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}

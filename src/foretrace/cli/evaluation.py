@@ -1,41 +1,35 @@
 """The command that runs experiments; its options are the fields of each experiment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from foretrace.cli.console import say
+from foretrace.cli.console import print_report, say
+from foretrace.cli.parsing import Command, adapt
 from foretrace.experiments import EXPERIMENTS, SUMMARIES
 
 if TYPE_CHECKING:
     from foretrace.evaluation.experiment import Experiment
 
 
-def experiment_commands(named: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
-    """A command for each experiment.
-
-    Args:
-        named: The experiment whose options are needed. The others are not imported, so that the help is quick.
-    """
-    if not named:
-        return {label: _stub(summary) for label, summary in SUMMARIES.items()}
+def experiment_commands() -> dict[str, Command]:
+    """A command for each experiment; its module is imported when the command is asked for."""
     return {
-        label: _command(EXPERIMENTS.find(label)) if label in named else _stub(SUMMARIES.get(label, ""))
+        label: Command(
+            SUMMARIES[label] if label in SUMMARIES else EXPERIMENTS.find(label).summary,
+            partial(_command, label),
+        )
         for label in EXPERIMENTS
     }
 
 
-def _stub(summary: str) -> Callable[..., int]:
-    def evaluate() -> int:
-        raise AssertionError("an experiment without its options cannot be run")
+def _command(label: str) -> Callable[..., int]:
+    kind = EXPERIMENTS.find(label)
 
-    evaluate.__doc__ = summary
-    return evaluate
-
-
-def _command(kind: "type[Experiment]") -> Callable[..., int]:
+    @adapt(run_folder="run")
     def evaluate(
         experiment: Any,
         out: Path | None = None,
@@ -51,8 +45,8 @@ def _command(kind: "type[Experiment]") -> Callable[..., int]:
     usual = "one for each core" if kind.workers is None else str(kind.workers)
     evaluate.__doc__ = f"""{kind.__doc__}
 
-    The same command goes on where an interrupted one stopped, and with other options it adds to the results where it
-    can. The exit status is 1 if trials failed.
+    The same command continues an interrupted one, and with other options it adds to the results where it can. The exit
+    status is 1 if trials failed.
 
     Args:
         experiment: What to run.
@@ -68,9 +62,6 @@ def _command(kind: "type[Experiment]") -> Callable[..., int]:
 def _evaluate(
     experiment: "Experiment", out: Path | None, workers: int | None, threads: int, dry_run: bool, redraw: bool
 ) -> int:
-    from rich.console import Console
-    from rich.markdown import Markdown
-
     from foretrace.evaluation.run import count_missing, run_experiment
 
     if dry_run:
@@ -83,9 +74,8 @@ def _evaluate(
         if out is not None:
             say(f"interrupted; finished trials stay in {out}, the same command goes on from there")
         raise
-    console = Console()
     if results.report:
-        console.print(Markdown(results.report)) if console.is_terminal else print(results.report)
+        print_report(results.report)
     for trial, message in results.failures:
         say(f"failed: {trial}: {' '.join(message.split())}")
     for file in results.files:

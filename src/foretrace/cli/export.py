@@ -1,29 +1,37 @@
 """Commands that write interactions for other tools, and predictors: export rosbag, rerun, lerobot, onnx."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 ROS, RERUN = ("rosbags", "ros"), ("rerun", "rerun")
 """Libraries that are not installed by default, and the extras that bring them."""
 
 
-def export_rosbag(
-    data: Path,
-    ids: tuple[int, ...],
-    out: Path,
-    run: Path | None = None,
-    ros: Literal[1, 2] = 2,
-    camera: bool = True,
-) -> None:
+@dataclass(frozen=True)
+class Source:
+    """What is written, and where."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder to make."""
+    run: Path | None = None
+    """Folder of a training, whose predictor's imagined motion is written beside the observed one."""
+
+
+Ids = tuple[int, ...]
+Options = Annotated[OmitArgPrefixes[Source], arg(name="")]
+
+
+def export_rosbag(source: Options, ids: Ids, ros: Literal[1, 2] = 2, camera: bool = True) -> None:
     """Write interactions as ROS bags, one each, and the RViz configuration that shows them. Needs foretrace[ros].
 
     Args:
-        data: Folder of the data set.
+        source: Data and folder.
         ids: Numbers of the interactions.
-        out: Folder to make for the bags.
-        run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
         ros: Version of ROS. 2: MCAP. 1: a .bag file.
         camera: Whether simulated interactions get the images of a camera beside the table.
     """
@@ -33,20 +41,16 @@ def export_rosbag(
     require(*ROS)
     from foretrace.export.rosbag import export_rosbags
 
-    export_rosbags(choose(data, ids, run), out, ros, camera)
-    _say_what_is_in(out)
+    export_rosbags(choose(source.data, ids, source.run), source.out, ros, camera)
+    _list_files(source.out)
 
 
-def export_rerun(
-    data: Path, ids: tuple[int, ...], out: Path, run: Path | None = None, camera: bool = True
-) -> None:
+def export_rerun(source: Options, ids: Ids, camera: bool = True) -> None:
     """Write interactions as Rerun recordings, one each. Needs foretrace[rerun].
 
     Args:
-        data: Folder of the data set.
+        source: Data and folder.
         ids: Numbers of the interactions.
-        out: Folder to make for the recordings.
-        run: Folder of a training, whose predictor's imagined motion is written beside the observed one.
         camera: Whether simulated interactions get the images of a camera beside the table.
     """
     from foretrace.export.delivery import require
@@ -55,35 +59,29 @@ def export_rerun(
     require(*RERUN)
     from foretrace.export import rerun
 
-    rerun.export_rerun(choose(data, ids, run), out, camera)
-    _say_what_is_in(out)
+    rerun.export_rerun(choose(source.data, ids, source.run), source.out, camera)
+    _list_files(source.out)
 
 
 def export_lerobot(
-    data: Path,
-    out: Path,
-    ids: tuple[int, ...] | None = None,
-    run: Path | None = None,
-    fps: int | None = None,
-    camera: bool = False,
+    source: Options, ids: Ids | None = None, fps: int | None = None, camera: bool = False
 ) -> None:
     """Write interactions as one LeRobotDataset v3.0, an episode each.
 
+    Episodes are ordered and split by the parts of a --run that was trained on this data set.
+
     Args:
-        data: Folder of the data set.
-        out: Folder to make.
+        source: Data and folder.
         ids: Numbers of the interactions; by default all that have a motion.
-        run: Folder of a training, whose predictor's imagined motion is written beside the observed one. If it was
-            trained on this data set, episodes are ordered and split by its parts.
         fps: Frames per second, to which all are resampled; by default the rate at which they were sampled.
         camera: Render the images of a camera beside the table; for simulated interactions only.
     """
     from foretrace.export.episodes import choose_by_part
     from foretrace.export.lerobot import export_lerobot
 
-    episodes, splits = choose_by_part(data, ids, run)
-    export_lerobot(episodes, out, fps, camera, splits)
-    print(out)
+    episodes, splits = choose_by_part(source.data, ids, source.run)
+    export_lerobot(episodes, source.out, fps, camera, splits)
+    print(source.out)
 
 
 def export_onnx(run: Positional[Path | None] = None, out: Path = Path("model.onnx")) -> None:
@@ -104,6 +102,6 @@ def export_onnx(run: Positional[Path | None] = None, out: Path = Path("model.onn
     print(written.path)
 
 
-def _say_what_is_in(out: Path) -> None:
+def _list_files(out: Path) -> None:
     for path in sorted(out.iterdir()):
         print(path)

@@ -1,31 +1,38 @@
 """The command that films a simulated lever-up, without a camera or a robot."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+import numpy as np
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
+from foretrace.cli.parsing import adapt
+from foretrace.errors import DatasetError, PerceptionError, SimulationError
+from foretrace.files import write_json
+from foretrace.geometry import invert_transform
+from foretrace.interactions import recording_folder
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.calibration import Board
+from foretrace.simulation.lens import WEBCAM
+from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.recording import RecordingConfig, photograph_board, record_lever_up
 
-if TYPE_CHECKING:
-    from foretrace.interactions.pinhole import PinholeCamera
+USUAL = RecordingConfig(depth_every=10)
+"""Recordings by default: depth makes large files."""
 
 
+@adapt((RecordingConfig, ("camera", "faults", "simulation")), frames_per_second="fps")
 def film(
     data: Positional[Path],
     id: Positional[int],
     out: Path,
-    width: int = 1280,
-    fps: float = 30.0,
-    slant: float = 0.6,
-    azimuth: float = 1.0,
-    distance: float = 0.7,
-    depth_every: int = 10,
+    config: Annotated[OmitArgPrefixes[RecordingConfig], arg(name="")] = USUAL,
+    width: int = WEBCAM.width,
     embodiment: Literal["tool", "arm"] | None = None,
     board: int = 0,
-    shadows: bool = False,
-    table: Literal["plain", "wooden", "speckled"] = "plain",
-    object_colour: Literal["blue", "grey", "brown"] = "blue",
     seed: int = 0,
 ) -> None:
     """Film a lever-up of a data set, simulated anew, as a camera above a real table would: a folder for `import`.
@@ -37,30 +44,12 @@ def film(
         data: Folder of the data set.
         id: Number of the interaction.
         out: Folder to make.
+        config: Camera, table and light.
         width: Columns of the images; they have 9/16 as many rows.
-        fps: Frames per second.
-        slant: Angle of the camera's line of sight from the vertical [rad].
-        azimuth: Where the camera stands, from the action's direction towards its left [rad].
-        distance: From the camera to the point on the table that it looks at [m].
-        depth_every: Images from one with depth to the next; 0: no depth.
         embodiment: What moves the blade: nothing that is seen, or the whole arm; by default as in the data set.
         board: Number of images of a calibration board to take, too; they leave the camera's file to `calibrate`.
-        shadows: Let a slanted lamp of some size cast soft shadows.
-        table: How the table looks.
-        object_colour: The object's colour; grey resembles the plain table, brown the wooden one.
         seed: Seed of noise, clock, table, and of where marker and lamp are.
     """
-    import numpy as np
-
-    from foretrace.errors import DatasetError, PerceptionError, SimulationError
-    from foretrace.files import write_json
-    from foretrace.geometry import invert_transform
-    from foretrace.interactions import recording_folder
-    from foretrace.interactions.dataset import Dataset
-    from foretrace.simulation.lens import WEBCAM
-    from foretrace.simulation.lever_up import SimulationConfig
-    from foretrace.simulation.recording import RecordingConfig, record_lever_up
-
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise PerceptionError(f"{out} is in use: choose another folder")
     for option, value, most in (("seed", seed, 2**32), ("board", board, 1000)):
@@ -70,7 +59,7 @@ def film(
     rows = np.flatnonzero(dataset.index["id"].to_numpy() == id)
     if len(rows) == 0:
         raise DatasetError(
-            f"{data} has no interaction {id} with a motion: `foretrace describe` lists what it has"
+            f"{data} has no interaction {id} with a motion: `foretrace data` counts what it has"
         )
     shown = dataset[int(rows[0])]
     camera = WEBCAM.scaled(width / WEBCAM.width)
@@ -78,18 +67,7 @@ def film(
     simulation = SimulationConfig(
         embodiment=embodiment or recorded.get("embodiment", "tool"), physics=shown.physics
     )
-    config = RecordingConfig(
-        camera,
-        distance,
-        slant,
-        azimuth,
-        fps,
-        depth_every=depth_every,
-        shadows=shadows,
-        table=table,
-        object_colour=object_colour,
-        simulation=simulation,
-    )
+    config = replace(config, camera=camera, simulation=simulation)
     obj, action = shown.object, shown.action
     if board:
         _film_board(out / "board", board, camera, seed)
@@ -113,12 +91,8 @@ def film(
     print(f"contact: --contact {x:.4f} {y:.4f}, in the first frame --contact-px {column:.0f} {row:.0f}")
 
 
-def _film_board(folder: Path, num: int, camera: "PinholeCamera", seed: int) -> None:
+def _film_board(folder: Path, num: int, camera: PinholeCamera, seed: int) -> None:
     """Images of the default calibration board."""
-    from foretrace.interactions import recording_folder
-    from foretrace.perception.calibration import Board
-    from foretrace.simulation.recording import photograph_board
-
     folder.mkdir(parents=True)
     printed = Board()
     images = photograph_board(printed.draw(4000.0), printed.size, camera, num, seed=seed)

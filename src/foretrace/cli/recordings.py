@@ -1,30 +1,39 @@
 """The command that imports a recording."""
 
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-from tyro.conf import Positional
+import numpy as np
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from foretrace.cli.contact import ContactOptions
+from foretrace.cli.parsing import adapt
 from foretrace.errors import PerceptionError
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.recorded import add_recorded
+from foretrace.interactions.recording_folder import CAMERA, MARKERS
+from foretrace.objects.shape_files import read_shape
+from foretrace.perception import importing
+from foretrace.perception.importing import Contact, ImportConfig
+from foretrace.perception.markers import MarkerLayout
+from foretrace.perception.recordings import open_recording
+from foretrace.perception.tracking import TrackConfig
 
-if TYPE_CHECKING:
-    from foretrace.interactions.pinhole import PinholeCamera
 
-
+@adapt(
+    (TrackConfig, [each.name for each in fields(TrackConfig) if each.name != "largest_gap"]),
+    largest_gap="max_gap",
+)
 def import_recording(
     recording: Positional[Path],
     out: Path,
+    at: Annotated[OmitArgPrefixes[ContactOptions], arg(name="contact")],
+    config: Annotated[OmitArgPrefixes[ImportConfig], arg(name="import")],
+    contact_px: tuple[float, float] | None = None,
     camera: Path | None = None,
     markers: Path | None = None,
     object: Path | None = None,
-    height: float | None = None,
-    contact: tuple[float, float] | None = None,
-    contact_px: tuple[float, float] | None = None,
-    edge: int | None = None,
-    fraction: float = 0.5,
-    start: float | None = None,
-    max_gap: float = 0.25,
-    shadows: bool = True,
     topic: str | None = None,
     depth_topic: str | None = None,
 ) -> None:
@@ -36,33 +45,17 @@ def import_recording(
     Args:
         recording: Folder of frames with timestamps.csv, video file, bag of ROS 1 or ROS 2, or RealSense recording.
         out: Folder of the data set.
+        at: Where it was levered, unless --contact-px says so.
+        config: How the recording is read.
+        contact_px: Column and row of the contact in the first frame, on the object's upper rim.
         camera: The camera's JSON file; by default camera.json beside the recording, or what a bag or a RealSense
             recording has.
         markers: Marker layout; by default markers.json beside the recording.
         object: The object's shape: a .json file from `to_dict`, an .stl or .obj mesh, or a text file with the outline's
             corners. Without it, the prism that its outline in the first frame shows.
-        height: Height of the object, if its shape is a text file or not given [m].
-        contact: Contact point in the object frame [m].
-        contact_px: Column and row of the contact in the first frame, on the object's upper rim.
-        edge: Number of the edge that was levered.
-        fraction: How far along that edge.
-        start: Time stamp at which the blade's path starts [s]; by default from when the object moves.
-        max_gap: The longest time without markers that is bridged [s].
-        shadows: Whether the object may cast shadows, which are then separated from it; else all that differs from the
-            background is the object.
         topic: Image topic of a bag, if it has several.
         depth_topic: Depth topic of a bag, aligned with the images; by default the one in the same frame, if any.
     """
-    from foretrace.interactions.pinhole import PinholeCamera
-    from foretrace.interactions.recorded import add_recorded
-    from foretrace.interactions.recording_folder import CAMERA, MARKERS
-    from foretrace.objects.shape_files import read_shape
-    from foretrace.perception import importing
-    from foretrace.perception.importing import Contact, ImportConfig
-    from foretrace.perception.markers import MarkerLayout
-    from foretrace.perception.recordings import open_recording
-    from foretrace.perception.tracking import TrackConfig
-
     opened = open_recording(recording, topic, depth_topic)
     intrinsics = camera or (None if opened.camera is not None else opened.beside(CAMERA))
     taken_by = opened.camera if intrinsics is None else PinholeCamera.load(intrinsics)
@@ -71,9 +64,8 @@ def import_recording(
     layout = markers or opened.beside(MARKERS)
     if layout is None:
         raise PerceptionError(f"{recording} has no {MARKERS} beside it: give --markers")
-    where = Contact(contact, contact_px, None if edge is None else (edge, fraction))
-    config = ImportConfig(track=TrackConfig(largest_gap=max_gap), start=start, height=height, shadows=shadows)
-    shape = None if object is None else read_shape(object, height)
+    where = Contact(at.contact, contact_px, at.share)
+    shape = None if object is None else read_shape(object, config.height)
     found = importing.import_recording(opened, taken_by, MarkerLayout.load(layout), where, shape, config)
     id = add_recorded(out, found.interaction, _notes(recording, taken_by, found))
     effect, track = found.interaction.effect, found.track
@@ -87,9 +79,8 @@ def import_recording(
     print(f"data set: {out}")
 
 
-def _notes(recording: Path, camera: "PinholeCamera", found: Any) -> dict[str, Any]:
+def _notes(recording: Path, camera: PinholeCamera, found: Any) -> dict[str, Any]:
     """What is kept beside an interaction: enough to draw it onto the recording again."""
-    import numpy as np
 
     def plain(values: np.ndarray) -> list[float | None]:
         return [float(value) if np.isfinite(value) else None for value in values]

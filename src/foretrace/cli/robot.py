@@ -1,10 +1,14 @@
 """The command that has a real arm execute a lever-up."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from tyro.conf import OmitArgPrefixes, arg
+
+from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli.console import say
 from foretrace.errors import RobotError
+from foretrace.robot.execution import WatchConfig
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,15 +21,14 @@ def robot(
     base: Path,
     contact: tuple[float, float],
     direction: tuple[float, float],
+    path: Annotated[OmitArgPrefixes[ToolPath], arg(name="path")],
+    watch: Annotated[OmitArgPrefixes[WatchConfig], arg(name="watch")],
     out: Path = Path("execution"),
     speed: float = 0.1,
-    clearance: float = 0.0004,
     retreat: bool = True,
     execute: bool = False,
     host: str | None = None,
     yes: bool = False,
-    timeout: float = 0.2,
-    deviation: float = 0.05,
     camera: str | None = None,
 ) -> None:
     """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm (experimental).
@@ -41,19 +44,16 @@ def robot(
         direction: Along which the blade is pushed, X Y in the table frame; its length does not matter.
         out: Folder for path.csv, checks.json, recording.csv and film.
         speed: Share of the tool path's own speed, at most 1.
-        clearance: Gap between the blade's tip and the table [m].
+        path: Path of the blade.
+        watch: When the motion is given up.
         retreat: Afterwards set the object down the way it was lifted, pull the blade out, and go up by 10 cm.
             Otherwise the arm stays at the path's end, with the object on the blade.
         execute: Move the arm.
         host: Name or address of the controller; needed with --execute.
         yes: Do not ask before the arm moves.
-        timeout: Longest silence of the controller before the motion is given up [s].
-        deviation: Largest angle between a joint and its path before the motion is given up [rad].
         camera: Film the motion into the folder's film: number of a camera, or what else OpenCV opens.
     """
-    from foretrace.actions import LeverUp, Screwdriver, ToolPath
     from foretrace.robot.checks import ArmLimits, check_path, refuse_unsafe
-    from foretrace.robot.execution import WatchConfig
     from foretrace.robot.execution import execute as move
     from foretrace.robot.kinematics import ArmKinematics
     from foretrace.robot.path import plan_lever_up, plan_retreat, read_base_pose
@@ -61,10 +61,9 @@ def robot(
 
     if execute and host is None:
         raise RobotError("--execute needs --host, the controller's address")
-    watch, limits, kinematics = WatchConfig(timeout, deviation), ArmLimits(), ArmKinematics(Screwdriver())
+    limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
-    action = LeverUp(contact, direction, ToolPath(clearance=clearance))
-    legs = plan_lever_up(kinematics, action, T_table_base, speed)
+    legs = plan_lever_up(kinematics, LeverUp(contact, direction, path), T_table_base, speed)
     legs += plan_retreat(legs) if retreat else []
     postures = [kinematics.along(leg.joints) for leg in legs]
     checks = [

@@ -27,14 +27,14 @@ Row = Mapping[str, Plain]
 EXPERIMENTS: Registry[type["Experiment"]] = Registry("experiment", "foretrace.experiments", ResultsError)
 """Every experiment by its label."""
 SUMMARIES = {
-    "predictor": "Errors of one trained predictor, over the full trajectory and at its end.",
-    "paper": "The paper's comparisons of features, training sizes, steps ahead and novel shapes.",
-    "randomisation": "What randomised training data do for transfer, and what it helps to know what was drawn.",
+    "predictor": "Errors of one trained predictor.",
+    "paper": "The paper's comparisons, claims and figures.",
+    "randomisation": "What randomised data and known physics add to transfer.",
     "reconstruction": "What the codes of autoencoders retain of masks.",
-    "replay": "How far simulated motions of rigid bodies stray from recorded ones.",
-    "transfer": "Predictions against recorded lever-ups, or against a stand-in for the real robot.",
+    "replay": "Deviation of simulated motions from recorded ones.",
+    "transfer": "Predictions against recordings, or a stand-in for the robot.",
     "non-flat": "Masks against height maps of objects that are not flat.",
-    "uncertainty": "How far to trust probabilities, regions and samples of a predictor of several futures.",
+    "uncertainty": "Calibration of probabilities, regions and samples.",
 }
 """Experiments that come with foretrace, each in a line; their modules are imported when they are looked up."""
 for _label in SUMMARIES:

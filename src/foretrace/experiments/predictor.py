@@ -23,6 +23,7 @@ from foretrace.pictures.style import DPI, STYLE
 from foretrace.predictor import load_predictor, part_of
 from foretrace.predictor.run_folder import fingerprint
 
+METRICS = {"full": "Over the full trajectory", "final": "At its end"}
 STATISTICS = {"mean_cm": "mean", "median_cm": "median", "p95_cm": "95 %"}
 
 
@@ -79,11 +80,11 @@ class Predictor(Experiment):
         return summary
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
-        """A table of the errors that start from the observed first sample, and the overall ones from the view."""
+        """Tables of the errors that start from the observed first sample, and the overall ones from the view."""
         parts = [f"# Errors of {self.run_folder}"]
         for part, starts in summary.items():
             where = f"all of {self.data}" if part == "all" else f"{part} part of {self.data}"
-            parts += [f"## {where}, in cm", errors_table(starts)]
+            parts += [f"## {where}, in cm", errors_tables(starts)]
         return "\n\n".join(parts) + "\n"
 
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
@@ -110,19 +111,18 @@ class Predictor(Experiment):
         return dataset.batch() if self.part == "all" else part_of(self.run_folder, dataset, self.part)
 
 
-def errors_table(starts: Mapping[str, Any]) -> str:
-    """Errors by group [cm]; of those that start from the view, the overall ones only."""
-    head = [
-        "interactions",
-        "number",
-        *(f"{m}, {words}" for m in ("full", "final") for words in STATISTICS.values()),
-    ]
-    lines = []
-    for start, groups in starts.items():
-        for group, found in groups.items():
-            if start == "estimated" and group != "all":
-                continue
-            name = group + (", start from view" if start == "estimated" else "")
-            numbers = [number(found[metric][key], 2) for metric in ("full", "final") for key in STATISTICS]
-            lines.append([name, str(found["count"]["full"]), *numbers])
-    return markdown_table(head, lines)
+def errors_tables(starts: Mapping[str, Any]) -> str:
+    """Errors by group [cm], a table for each metric; of those that start from the view, the overall ones only."""
+    parts = []
+    for metric, title in METRICS.items():
+        lines = []
+        for start, groups in starts.items():
+            for group, found in groups.items():
+                if start == "estimated" and group != "all":
+                    continue
+                name = group + (", start from view" if start == "estimated" else "")
+                numbers = [number(found[metric][key], 2) for key in STATISTICS]
+                lines.append([name, str(found["count"][metric]), *numbers])
+        head = ["interactions", "number", *STATISTICS.values()]
+        parts += [f"### {title}", markdown_table(head, lines)]
+    return "\n\n".join(parts)

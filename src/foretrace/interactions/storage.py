@@ -255,7 +255,7 @@ def read_shard(
         DatasetError: The file is missing, damaged, or of another schema.
     """
     path = folder / name
-    remedy = f"`foretrace doctor {folder} --repair` sets it aside, then `foretrace simulate` makes it again"
+    remedy = f"`foretrace data {folder} --repair` sets it aside, then `foretrace simulate` makes it again"
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -1,7 +1,7 @@
 """Settings of a predictor and of its training, checked when they are made."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from foretrace.errors import TrainingError
@@ -134,3 +134,9 @@ class PredictorConfig:
     def make_features(self) -> FeatureExtractor:
         """The feature extractor."""
         return make_features(self.features, **self.feature_options)
+
+
+def feature_option(name: str, config_class: type[PredictorConfig]) -> str:
+    """Name of a feature extractor's setting beside the settings of a predictor and of its training."""
+    taken = {each.name for each in (*fields(config_class), *fields(TrainConfig))}
+    return f"feature_{name}" if name in taken else name

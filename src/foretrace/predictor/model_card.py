@@ -15,6 +15,7 @@ from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
 from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
 from foretrace.predictor.checkpoint import read_config
+from foretrace.predictor.config import feature_option
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
@@ -91,20 +92,19 @@ def _data(
 
 def _training(run: Path, data: Path) -> str:
     content, predictor = read_config(run), load_predictor(run)
-    usual = flatten(as_json(asdict(type(predictor.config)())))
-    options = {
-        name.removeprefix("feature_options."): value
-        for name, value in flatten(content["config"]).items()
-        if value != usual.get(name)
-    }
+    nominal = as_json(asdict(type(predictor.config)()))
+    options = {name: value for name, value in content["config"].items() if value != nominal.get(name)}
+    given = options.pop("feature_options", {})
+    options |= {feature_option(name, type(predictor.config)): value for name, value in given.items()}
     training = content["training"]
     options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
     command = [f"foretrace train --data {data} --out {run} --predictor {predictor.label}"]
     for name, value in options.items():
-        if name in RUNTIME_OPTIONS or value is None or value is False:
+        if name in RUNTIME_OPTIONS or value is None:
             continue
-        values = [] if value is True else value if isinstance(value, list) else [value]
-        command.append(" ".join([f"--{name.replace('_', '-')}", *map(str, values)]))
+        values = [] if isinstance(value, bool) else value if isinstance(value, list) else [value]
+        option = f"--{'no-' if value is False else ''}{name.replace('_', '-')}"
+        command.append(" ".join([option, *map(str, values)]))
     environment = read_json(run / ENVIRONMENT, TrainingError, "give the whole folder of a training")
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return (

@@ -55,7 +55,9 @@ class CollectConfig:
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     """How each lever-up is simulated."""
     recipe: str = "paper"
-    """Which objects: one of RECIPES."""
+    """Kind of objects. paper: prisms. solids: lying cylinders, boxes and flat prisms, always three with one outline.
+    mixed: prisms and solids. everyday: the same with prisms of many sizes, and flat objects with round, organic and
+    dented outlines."""
     randomisation: Randomisation = NOTHING
     """What is drawn anew for every lever-up."""
     path: ToolPath = field(default_factory=ToolPath)

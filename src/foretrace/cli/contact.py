@@ -1,0 +1,61 @@
+"""Options that say where an object is levered."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from foretrace.errors import ActionError, PredictionError
+
+if TYPE_CHECKING:
+    from foretrace.actions import LeverUp
+    from foretrace.objects import ObjectModel
+
+LARGEST_SNAP = 0.02
+"""A contact point farther from the outline is a mistake and is not moved there [m]."""
+
+
+@dataclass(frozen=True)
+class ContactOptions:
+    """The contact."""
+
+    edge: int | None = None
+    """Number of the outline's edge to lever at; edge k runs from corner k to corner k + 1."""
+    fraction: float | None = None
+    """Share of that edge before the contact, between 0 and 1; 0.5 by default."""
+    contact: tuple[float, float] | None = None
+    """Point to lever at instead, in the object's frame [m]; moved to the outline. An image's frame has its origin at
+    the silhouette's centroid, x to the right and y up."""
+
+    @property
+    def share(self) -> tuple[int, float] | None:
+        """Edge, and share of it before the contact; None without an edge.
+
+        Raises:
+            PredictionError: A share of no edge is given.
+        """
+        if self.edge is None and self.fraction is not None:
+            raise PredictionError("--fraction goes with --edge: give one, or leave it out")
+        return None if self.edge is None else (self.edge, 0.5 if self.fraction is None else self.fraction)
+
+    def place(self, obj: "ObjectModel") -> "LeverUp":
+        """The lever-up of an object.
+
+        Raises:
+            PredictionError: Options do not go together.
+            ActionError: There is no such edge, or the point is too far from the outline.
+        """
+        from foretrace.actions import LeverUp
+
+        if (self.edge is None) == (self.contact is None):
+            raise PredictionError("give either --edge (with --fraction) or --contact X Y")
+        if self.share is not None:
+            return LeverUp.at_edge(obj, *self.share)
+        assert self.contact is not None
+        action = LeverUp.nearest(obj, self.contact)
+        gap = float(np.linalg.norm(action.contact - self.contact))
+        if gap > LARGEST_SNAP:
+            raise ActionError(
+                f"contact {self.contact} lies {gap:.3f} m from the outline: choose a point within {LARGEST_SNAP} m"
+            )
+        return action

@@ -1,0 +1,58 @@
+"""The command that simulates data sets."""
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, arg
+
+from foretrace.cli.console import print_outcomes, say
+from foretrace.cli.parsing import adapt
+from foretrace.simulation.collect import CollectConfig, collect
+from foretrace.simulation.lever_up import SimulationConfig
+
+ROLLING_TIME = 1.5
+"""Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
+
+
+@adapt((CollectConfig, ("randomisation", "tool")), (SimulationConfig, ("watch_time",)))
+def simulate(
+    out: Path,
+    config: Annotated[OmitArgPrefixes[CollectConfig], arg(name="")],
+    watch_time: float | None = None,
+    randomise: bool = False,
+    vary_action: bool = False,
+    workers: int | None = None,
+) -> None:
+    """Simulate lever-ups of many objects into a data set.
+
+    The same command continues an interrupted simulation. The same seed gives the same data, whatever the number of
+    workers.
+
+    Args:
+        out: Folder of the data set.
+        config: Content of the data set.
+        watch_time: Time for which the object is observed after the blade has stopped [s]; by default 0 for the paper's
+            prisms, and 1.5 otherwise, since solids may roll.
+        randomise: Draw friction, density, thickness and bevel anew for every lever-up, and offset the blade in place
+            and direction. Objects and commanded contacts stay the same.
+        vary_action: Draw insertion, arc and speed of the blade anew for every lever-up.
+        workers: Number of processes; by default one for each core.
+    """
+    from dataclasses import replace
+
+    from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION
+
+    if watch_time is None:
+        watch_time = 0.0 if config.recipe == "paper" else ROLLING_TIME
+    randomisation = RANDOMISED if randomise else NOTHING
+    if vary_action:
+        randomisation = replace(randomisation, **VARIED_ACTION)
+    simulation = replace(config.simulation, watch_time=watch_time)
+    config = replace(config, simulation=simulation, randomisation=randomisation)
+    try:
+        counts = collect(config, out, workers)
+    except KeyboardInterrupt:
+        say(f"interrupted; what is done stays in {out}, the same command goes on from there")
+        raise
+    print_outcomes(counts)
+    print(f"data set: {out}")

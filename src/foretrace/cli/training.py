@@ -1,0 +1,140 @@
+"""The command that trains predictors. Its options are the settings of the chosen predictor and of the training loop."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import field, fields, make_dataclass, replace
+from inspect import Parameter, getdoc, signature
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import docstring_parser
+from tyro.conf import OmitArgPrefixes, arg
+
+from foretrace import predictor as learned
+from foretrace.cli.console import say
+from foretrace.cli.parsing import adapt
+from foretrace.features import FEATURES, FeatureExtractor
+from foretrace.files import write_text
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.record import Outcome
+from foretrace.interactions.splits import PAPER_SIZES
+from foretrace.predictor import PREDICTORS, PredictorConfig, TrainConfig
+from foretrace.predictor.config import feature_option
+from foretrace.predictor.model_card import model_card
+from foretrace.predictor.run_folder import RunFolder
+
+CARD = "MODEL_CARD.md"
+
+
+def train_command(words: Sequence[str]) -> Callable[..., None]:
+    """The command with the options of the predictor and the features that words name.
+
+    Args:
+        words: What follows ``foretrace train``.
+
+    Raises:
+        TrainingError: There is no such predictor, or there are no such features.
+    """
+    label = _value("--predictor", words) or "lstm"
+    config_class = PREDICTORS.find(label).config_class
+    settings = [each.name for each in fields(config_class)]
+    features = FEATURES.find(_value("--features", words) or config_class().features)
+    shared = [each.name for each in fields(TrainConfig) if each.name in settings]
+
+    @adapt((config_class, ("feature_options",)), (TrainConfig, ("split", *shared)))
+    def train(
+        *,
+        data: Path,
+        out: Path,
+        config: Any,
+        extractor: Any,
+        training: Any = config_class.training,
+        predictor: str = "lstm",
+        split: tuple[int, int, int] | None = None,
+        fresh: bool = False,
+        card: bool = False,
+    ) -> None:
+        values = [(each, getattr(extractor, each.name)) for each in fields(extractor)]
+        given = {each.metadata["name"]: value for each, value in values if value != each.default}
+        named = {word.partition("=")[0] for word in words if word.startswith("--")}
+        if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
+            _train(data, out, replace(config, feature_options=given), training, split, fresh)
+        if card:
+            write_text(out / CARD, model_card(out, data))
+            print(out / CARD)
+
+    train.__doc__ = f"""Train a predictor on a data set.
+
+    The same command continues an interrupted training. Options depend on the predictor and its features: `foretrace
+    train --predictor one-shot --help` lists those of another one.
+
+    Args:
+        data: Folder of the data set.
+        out: Folder of the training: model, settings, metrics, split, TensorBoard events.
+        config: Settings of the predictor.
+        extractor: Settings of the features {features.label}; those of the predictor's --features are listed.
+        training: Settings of the training loop.
+        predictor: Kind of predictor: {", ".join(PREDICTORS)}.
+        split: Sizes of the training, validation and test parts; by default the paper's 1400 100 300, or in the same
+            proportions where there are fewer interactions.
+        fresh: Discard the training in the folder instead of continuing it.
+        card: Write a model card to the folder, too: data, errors and calibration on the test part, limits. A finished
+            training needs no other options than --data and --out.
+    """
+    train.__annotations__ |= {
+        "config": Annotated[OmitArgPrefixes[config_class], arg(name=label)],
+        "extractor": Annotated[
+            OmitArgPrefixes[feature_settings(features, config_class)], arg(name=features.label)
+        ],
+        "training": Annotated[OmitArgPrefixes[TrainConfig], arg(name="training")],
+    }
+    return train
+
+
+def feature_settings(features: type[FeatureExtractor], config_class: type[PredictorConfig]) -> type:
+    """Settings of a feature extractor as a dataclass of options; None or the extractor's default: not given."""
+    documented = [docstring_parser.parse(getdoc(each) or "").params for each in features.__mro__]
+    about = {entry.arg_name: entry.description for entry in next(filter(None, documented), [])}
+    hints = get_type_hints(features.__init__)
+    settings = []
+    for name, parameter in signature(features.__init__).parameters.items():
+        if name == "self" or parameter.kind is Parameter.VAR_KEYWORD:
+            continue
+        text = " ".join((about.get(name) or "").split())
+        if isinstance(parameter.default, bool):
+            kind, default = bool, parameter.default
+        else:
+            kind, default = hints[name] | None, None
+            text = f"{text} (default: {parameter.default})".lstrip()
+        option = feature_option(name, config_class)
+        settings.append((option, kind, field(default=default, metadata={"help": text, "name": name})))
+    return make_dataclass("FeatureSettings", settings, frozen=True)
+
+
+def _value(option: str, words: Sequence[str]) -> str | None:
+    """The last value of an option that is written ``--option value`` or ``--option=value``."""
+    value = None
+    for word, following in zip(words, [*words[1:], None], strict=True):
+        name, equals, inside = word.partition("=")
+        if name == option:
+            value = inside if equals else following
+    return value
+
+
+def _train(
+    data: Path,
+    out: Path,
+    config: PredictorConfig,
+    training: TrainConfig,
+    split: tuple[int, int, int] | None,
+    fresh: bool,
+) -> None:
+    outcomes = training.outcomes or getattr(config, "outcomes", None) or (str(Outcome.LEVERED),)
+    dataset = Dataset.open(data).where(outcome=outcomes)
+    if split is None:
+        split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
+    try:
+        learned.train_predictor(dataset, config, out, replace(training, split=split), resume=not fresh)
+    except KeyboardInterrupt:
+        say(f"interrupted; the best model so far is in {out}, the same command goes on from there")
+        raise
+    print(f"predictor: {out}")
