@@ -24,7 +24,7 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
 
 CACHE_BYTES = 256 * 2**20
-"""Shards are kept in memory up to this size, about 5,000 interactions."""
+"""A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
 ROWS_AT_ONCE = 500
 """Interactions that are read together where a data set is gone through."""
 MOST_OBJECTS = 2000
@@ -142,7 +142,7 @@ class Dataset:
 
     ``dataset[3]`` is the fourth interaction; ``dataset[10:20]`` and ``dataset[indices]`` are data sets again.
 
-    Images and trajectories are read from disk when they are needed, and kept in memory while they fit into
+    Images and trajectories are read from disk when they are needed, and kept in memory if all fit into
     `CACHE_BYTES`: a data set may be larger than memory, as long as it is read by iteration or by `batches`.
     """
 
@@ -372,14 +372,12 @@ class Dataset:
 
 
 class _Shards:
-    """Tables of a data set's shards, kept in memory while they fit; beyond that, the last one that was read."""
+    """Tables of a data set's shards, kept in memory if all of them fit; otherwise only the last one that was read."""
 
     def __init__(self, path: Path, checksums: Mapping[str, str | None]):
         self.path = path
         self._checksums = sorted(checksums.items())
         self._kept: dict[int, pa.Table] = {}
-        self._bytes = 0
-        self._last: tuple[int, pa.Table] | None = None
 
     def __len__(self) -> int:
         return len(self._checksums)
@@ -390,16 +388,14 @@ class _Shards:
         Raises:
             DatasetError: It is missing or corrupt.
         """
-        last = self._last[1] if self._last is not None and self._last[0] == number else None
-        table = self._kept.get(number, last)
+        table = self._kept.get(number)
         if table is None:
             name, checksum = self._checksums[number]
             table = storage.read_shard(self.path, name, checksum, columns=columns)[0]
-            if columns is None and self._bytes + table.nbytes <= CACHE_BYTES:
-                self._bytes += table.nbytes
+            if columns is None:
+                if table.nbytes * len(self) > CACHE_BYTES:
+                    self._kept.clear()
                 self._kept[number] = table
-            elif columns is None:
-                self._last = number, table
         return table if columns is None else table.select(columns)
 
 
