@@ -1,6 +1,5 @@
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,11 +32,6 @@ def short(interaction) -> Interaction:
     names = ("times", "pose_trajectory", "com_trajectory", "tool_trajectory", "joint_trajectory")
     chosen = {name: getattr(effect, name)[10:50:10] for name in names}
     return replace(interaction, effect=replace(effect, **chosen, slip_index=3))
-
-
-def dataset_of(interactions: list[Interaction]) -> Dataset:
-    table = storage.to_table([storage.encode(interaction, interaction.id) for interaction in interactions])
-    return Dataset(table, {}, Path("somewhere"))
 
 
 def texts(fig: Figure) -> list[str]:
@@ -114,16 +108,16 @@ def test_silhouette_spans_the_object():
     np.testing.assert_allclose(ring.max(axis=0), [0.25, 0.13], atol=1e-4)
 
 
-def test_contact_sheet_shows_every_outcome():
-    made = factories.fake_interactions(np.random.default_rng(1), 15)
-    fig = contact_sheet(dataset_of(made), columns=4, rows=3)
+def test_contact_sheet_shows_every_outcome(tmp_path):
+    dataset = Dataset.open(factories.fake_data_set(tmp_path, objects=4))
+    fig = contact_sheet(dataset, columns=4, rows=3)
     assert len(fig.axes) == 12
     shown = texts(fig)
-    assert "15 interactions, 12 shown; the bar is 10 cm" in shown
-    assert "levered: 13" in shown
+    assert "18 interactions, 12 shown; the bar is 10 cm" in shown
+    assert "levered: 16" in shown
     assert "slipped: 2" in shown
     with pytest.raises(DatasetError, match="no interaction to show"):
-        contact_sheet(dataset_of([]))
+        contact_sheet(dataset.where(outcome="missed"))
 
 
 def test_faces_close_around_a_prism(interaction):

@@ -264,7 +264,7 @@ def test_an_experiment_measures_what_its_kept_trainings_give(folder, tmp_path):
 
 
 def test_no_interaction_is_in_two_parts_and_novel_shapes_are_never_learned_from(batch):
-    for setting in uncertainty.SETTINGS:
+    for setting in ("shuffled", "novel-shapes"):
         split = uncertainty.split_of(batch, setting, 1)
         rows = np.concatenate([split.train, split.validation, split.test])
         assert sorted(rows) == list(range(len(batch)))

@@ -52,7 +52,6 @@ from foretrace.trajectories import warped_distance
 
 CM = 100.0
 PRINTED_SHOWN = (("pentagon", 1), ("pentagon", 3), ("heptagon", 2), ("heptagon", 6))
-"""Printed edges whose paths are drawn."""
 DRAWN = {"everyday": "figure-15", "silhouettes": "silhouettes", "prisms": "prisms"}
 """Groups whose masks and errors are drawn, and the name of the picture."""
 
@@ -136,14 +135,18 @@ class Transfer(Experiment):
         about = {"model": weights_of(self.predictor), "features": self._predictor.features.label}
         if self.recorded is not None:
             return about | {"recorded": fingerprint(self._dataset.batch())}
-        return about | {"repeats": self._repeats, "seed": self.seed or 0, "stand_in": asdict(self._stand_in)}
+        return about | {
+            "repeats": (self.repeats or 10),
+            "seed": self.seed or 0,
+            "stand_in": asdict(self._stand_in),
+        }
 
     def run(self, trial: TransferTrial, folder: Path) -> Sequence[Row]:
         """A row for each lever-up: distances [cm], and what was drawn in SI units; the first one has paths, too."""
         if self.recorded is not None:
             return self._run_recorded(trial)
         subject = self._subjects[trial.group, trial.object]
-        played = play(subject, trial.contact - 1, self._stand_in, self._repeats, self.seed or 0)
+        played = play(subject, trial.contact - 1, self._stand_in, (self.repeats or 10), self.seed or 0)
         return compare_played(self._predictor, played, subject.hull, paths=trial.group == "printed")
 
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
@@ -176,10 +179,6 @@ class Transfer(Experiment):
                 paper = PAPER_OBJECTS if group == "everyday" else {}
                 figures[name] = objects_figure(subjects, mine, self._stand_in, paper)
         return figures
-
-    @property
-    def _repeats(self) -> int:
-        return 10 if self.repeats is None else self.repeats
 
     @cached_property
     def _stand_in(self) -> StandIn:
@@ -265,7 +264,7 @@ def compare_played(
 
     Args:
         predictor: The predictor.
-        played: What was simulated and observed there.
+        played: Simulated and observed lever-ups.
         hull: Whether the predictor has the convex hull of the object's mask.
         paths: Whether the first row gets the paths, as text.
     """
@@ -308,7 +307,7 @@ def compare(
 
     Args:
         predictor: The predictor.
-        view: What it sees.
+        view: The object from above, as the predictor observes it.
         observed: What the stand-in showed.
         simulated: What the simulator of the training data made of it.
         told: What a predictor that knows physical constants is told of them; by default the stand-in's own.

@@ -56,7 +56,6 @@ from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_lengths
 
 Setting = Literal["shuffled", "novel-shapes"]
-SETTINGS: tuple[Setting, ...] = ("shuffled", "novel-shapes")
 """How the split is drawn."""
 HELD_OUT = (5, 6)
 """Corner counts of novel shapes, by default."""
@@ -75,10 +74,7 @@ ERRORS = {
     "rotation": "Rotation, median [°]",
     "final_rotation": "Final rotation, median [°]",
 }
-WORDS = {
-    **SPLIT_WORDS,
-    **BEGINNING_WORDS,
-}
+WORDS = {**SPLIT_WORDS, **BEGINNING_WORDS}
 DIGITS = 4
 
 Numbers = Mapping[str, float | None]
@@ -89,7 +85,7 @@ class UncertaintyTrial(Trial):
     """One training and all that is measured of it."""
 
     split: str
-    """One of SETTINGS."""
+    """A `Setting`."""
     seed: int
     """Seed of split, training and samples."""
 
@@ -103,7 +99,7 @@ class Uncertainty(Experiment):
     that are there are drawn again."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of splits, trainings and samples."""
-    splits: tuple[Setting, ...] = SETTINGS
+    splits: tuple[Setting, ...] = ("shuffled", "novel-shapes")
     """shuffled: the paper's sizes, any interaction in any part. novel-shapes: tested on corner counts that were not
     learned from."""
     held_out: tuple[int, ...] = HELD_OUT
