@@ -106,7 +106,7 @@ def test_a_warning_is_one_line(folder, capsys):
     del manifest["shards"][storage.shard_name(1)]
     storage.write_manifest(folder, manifest)
     capsys.readouterr()
-    assert cli.main(["show", str(folder), "--out", str(folder / "sheet.png")]) == 0
+    assert cli.main(["show", str(folder), "--id", "3", "--out", str(folder / "one.svg")]) == 0
     printed = capsys.readouterr().err
     assert printed.startswith(f"foretrace: warning: {folder} is not finished: 1 of 2 shards are missing")
     assert printed.count("\n") == 1
@@ -130,6 +130,7 @@ def test_show_refuses_what_it_cannot_draw(folder, capsys):
     assert "no interaction 104" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_evaluate_goes_on_and_prints_what_it_found(folder, tmp_path, capsys):
     out = tmp_path / "results"
     command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1".split()
@@ -343,6 +344,7 @@ def group_lives(group: int) -> bool:
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_keeps_what_is_done_and_says_how_to_go_on(tmp_path, sent):
     fast = ["--embodiment", "tool", "--insert-time", "0.1", "--lift-time", "0.2", "--hold-time", "0"]
