@@ -213,7 +213,7 @@ def test_options_of_predict_are_checked(given, knows, simulated, message):
 
 
 def test_the_actions_parameters_are_context_as_constants_are(batch):
-    assert set(PARAMETERS) == set(nominal_parameters())
+    assert set(PARAMETERS) == set(LeverUp.nominal_parameters())
     rng = np.random.default_rng(3)
     sweep = rng.uniform(0.4, 1.0, 40)
     rest = batch.com[:, :1]

@@ -98,6 +98,8 @@ def test_dataset_reads_what_was_written_and_hides_failures(folder, interactions)
     assert_equal(dataset[-1], interactions[-1])
     assert_equal(dataset.with_id(14), interactions[14])
     assert dataset.outcomes() == {"levered": 17, "slipped": 2}
+    assert repr(dataset) == f"Dataset({str(folder)!r}: 19 interactions: 17 levered, 2 slipped)"
+    assert repr(dataset[:0]) == f"Dataset({str(folder)!r}: 0 interactions)"
 
 
 def test_failed_interaction_has_no_trajectory(folder):

@@ -14,7 +14,7 @@ from foretrace.imagined.domain import check_view, find_unusual, measure, ranges_
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Box, sample_prism
-from foretrace.predictor import LstmConfig, OneShotConfig, TrainConfig, load_predictor, train_predictor
+from foretrace.predictor import OneShotConfig, TrainConfig, load_predictor, train_predictor
 
 CONFIG = OneShotConfig(hidden=8, outcomes=("levered", "slipped"))
 QUICK = TrainConfig(epochs=1, min_steps=1, split=None, learning_rate=4e-3)
@@ -94,15 +94,6 @@ def test_small_spots_and_inexact_contacts_are_fine(view):
     check_view(TopDownView(mask, height))
     for rows in (-5, 5):
         check_view(shifted(view, rows))
-
-
-def test_every_predictor_refuses_nonsense(view):
-    predictor = LstmConfig(features="none").make(4).eval()
-    predictor.imagine(view)
-    with pytest.raises(PredictionError, match="2 objects"):
-        predictor.imagine(NONSENSE["shows 2 objects"](view))
-    with pytest.raises(PredictionError, match="give a finite centre of mass"):
-        predictor.imagine(view, com=[0.0, np.nan, 0.0])
 
 
 def test_measures_are_those_of_the_object(view):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from engines_at_hand import WITHOUT_BULLET
 from export_samples import fake_data
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
@@ -44,6 +45,12 @@ def test_examples_are_short_and_say_what_they_do(example: Path) -> None:
     text = example.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MAX_LINES
     assert text.startswith('"""')
+
+
+def test_own_experiment(tmp_path: Path) -> None:
+    printed = run_python(EXAMPLES / "own_experiment.py", tmp_path / "out")
+    assert len(re.findall(r"^\| (0.3|0.8|1.2) \| \d+\.\d\d \|$", printed, re.MULTILINE)) == 3
+    assert {"rows.csv", "summary.json", "report.md"} <= {file.name for file in (tmp_path / "out").iterdir()}
 
 
 def test_predict_a_polygon_with_a_predictor(tmp_path: Path) -> None:
@@ -126,3 +133,11 @@ def test_render_scene(tmp_path: Path) -> None:
     printed = run_python(EXAMPLES / "render_scene.py", tmp_path / "scene.png")
     assert "levered, at 4 moments" in printed
     assert np.ptp(np.asarray(Image.open(tmp_path / "scene.png"))) > 100
+
+
+@WITHOUT_BULLET
+def test_own_action(tmp_path: Path) -> None:
+    printed = run_python(EXAMPLES / "own_action.py", tmp_path / "pushes")
+    moved = re.findall(r"pushed, ([\d.]+) cm in MuJoCo, ([\d.]+) in Bullet; same again: True", printed)
+    assert len(moved) == 3
+    assert all(abs(float(mujoco) - float(bullet)) < 1 for mujoco, bullet in moved)

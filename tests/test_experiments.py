@@ -61,7 +61,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = QUICK["lstm"].change(
         features="ae-256", feature_options=factories.QUICK_OPTIONS["ae-256"], split=(30, 4, 6)
     )
-    train_predictor(Dataset.open(root / "plain"), recipe.predictor, root / "run", recipe.training, progress=False)
+    train_predictor(
+        Dataset.open(root / "plain"), recipe.predictor, root / "run", recipe.training, progress=False
+    )
     save_checkpoint(root / "untrained", QUICK["lstm"].change(features="none").make(60))
     return root
 

@@ -17,7 +17,7 @@ from foretrace.export.episodes import Episode, choose
 from foretrace.export.images import CAMERA, camera_pose, render_images
 from foretrace.export.resampling import frame_times, frames_per_second, resample_poses
 from foretrace.geometry import invert_transform, pose_to_matrix, transform_points
-from foretrace.imagined import ImaginedEffect
+from foretrace.imagined import Futures, ImaginedEffect
 from foretrace.interactions.record import Outcome
 
 
@@ -81,7 +81,9 @@ def test_an_imagined_pose_is_that_of_the_object_frame():
     )
     turned = Rotation.from_matrix(since_rest[:, :3, :3]).as_quat(scalar_first=True)
     perfect = np.concatenate([effect.com_trajectory, turned], axis=1)
-    episode = Episode(interaction, ImaginedEffect(effect.times, effect.com_trajectory, perfect))
+    turns = Rotation.from_matrix(since_rest[:, :3, :3]).as_rotvec()
+    futures = Futures.point(effect.com_trajectory[None], turns[None], "levered")
+    episode = Episode(interaction, ImaginedEffect(effect.times, effect.com_trajectory, perfect, futures))
     np.testing.assert_allclose(
         pose_to_matrix(episode.imagined_pose), pose_to_matrix(effect.pose_trajectory), atol=1e-12
     )

@@ -109,7 +109,9 @@ def test_a_distribution_is_that_of_the_predictor(command, views):
 
 def test_the_command_says_what_it_measured_and_the_example_runs(command):
     _, file, printed = command
-    measured = re.findall(r"^says (\w+): .*; at most (\d\.\de-\d+) from PyTorch$", printed, re.MULTILINE)
+    measured = re.findall(
+        r"^(?:says|returns) (\w+): .*; at most (\d\.\de-\d+) from PyTorch$", printed, re.MULTILINE
+    )
     assert [name for name, _ in measured][:2] == ["probability", "com_trajectory"]
     assert 0 < max(float(number) for _, number in measured) <= exporting.TOLERANCE
     assert re.search(r"^\d+%: the centre of mass ends at \[", run_python(EXAMPLES / "run_onnx.py", file))

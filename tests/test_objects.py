@@ -15,6 +15,7 @@ from foretrace.objects import (
     CIRCLE_RADIUS,
     CORNER_COUNTS,
     NO_BEVEL,
+    OBJECTS,
     Bevel,
     MeshObject,
     Prism,
@@ -294,8 +295,8 @@ def test_objects_survive_json_to_the_last_digit(obj):
 @pytest.mark.parametrize(
     ("values", "fault"),
     [
-        ({"kind": "blob"}, "kind 'blob': available are prism, box, cylinder, mesh"),
-        ({}, "kind None"),
+        ({"kind": "blob"}, "unknown object 'blob'; available: .*box"),
+        ({}, "unknown object None"),
         ({"kind": "prism"}, "prism is not usable"),
         ({"kind": "mesh", "vertices": [], "faces": [], "bevel": [1]}, "mesh is not usable"),
     ],
@@ -303,3 +304,25 @@ def test_objects_survive_json_to_the_last_digit(obj):
 def test_unusable_descriptions_are_refused(values, fault):
     with pytest.raises(ShapeError, match=fault):
         object_from_dict(values)
+
+
+def test_a_family_of_ones_own_registers_itself_and_is_recorded():
+    class Tile(Prism):
+        kind = "tile"
+
+        @classmethod
+        def from_dict(cls, values):
+            return cls(values["corners"], values["height"])
+
+        def to_dict(self):
+            return {"kind": self.kind, "corners": self.corners.tolist(), "height": self.height}
+
+    try:
+        tile = Tile([(0.0, 0.0), (0.1, 0.0), (0.1, 0.1)], 0.02)
+        again = object_from_dict(json.loads(json.dumps(tile.to_dict())))
+        assert type(again) is Tile
+        np.testing.assert_array_equal(again.corners, tile.corners)
+    finally:
+        del OBJECTS._entries["tile"]
+    with pytest.raises(ShapeError, match="unknown object 'tile'"):
+        object_from_dict(tile.to_dict())

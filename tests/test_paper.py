@@ -80,14 +80,13 @@ def test_every_comparison_gives_every_number_once(results):
 
 def test_neither_workers_nor_order_nor_other_trials_change_a_value(data, results, tmp_path):
     experiment = Paper(
-        data, ("novel-corners", "support-points", "half-plane"), ("sp-pred", "sc-800"), ("9&10", "5", "shuffled"), (0,),
+        data, ("novel-corners", "support-points"), ("sp-pred",), ("9&10", "5"), (0,),
         proportional=True, recipes=QUICK, feature_options=factories.QUICK_OPTIONS,
     )  # fmt: skip
     found = keyed(run_experiment(experiment, tmp_path, workers=2, console=QUIET).rows)
     whole = keyed(results)
-    shared = found.keys() & whole.keys()
-    assert len(shared) > 3 * 6
-    assert {key: found[key] for key in shared} == {key: whole[key] for key in shared}
+    assert len(found) > 2 * 6
+    assert {key: whole[key] for key in found} == found
 
 
 def test_settings_make_a_difference(results):

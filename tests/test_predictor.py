@@ -130,20 +130,6 @@ def test_imagine_equals_a_hand_unrolled_loop(batch, ahead, residual):
     assert imagined.pose_trajectory is None
 
 
-@pytest.mark.parametrize("state", ["position", "pose"])
-def test_a_batch_is_imagined_as_its_singles(batch, state):
-    predictor = make(batch, state=state)
-    imagined = predictor.imagine_batch(batch)
-    assert len(imagined) == len(batch)
-    for k in range(len(batch)):
-        view = TopDownView(batch.mask[k], batch.height[k])
-        alone = predictor.imagine(view, com=batch.com[k, 0])
-        np.testing.assert_allclose(alone.com_trajectory, imagined[k].com_trajectory, atol=1e-6)
-        np.testing.assert_array_equal(alone.com_trajectory[0], batch.com[k, 0])
-        if state == "pose":
-            np.testing.assert_allclose(alone.pose_trajectory, imagined[k].pose_trajectory, atol=1e-5)
-
-
 def test_imagining_leaves_training_mode_and_random_numbers_alone(batch):
     predictor = make(batch).train()
     before = torch.random.get_rng_state()
@@ -160,12 +146,6 @@ def test_the_start_can_be_estimated_from_the_view(batch):
     np.testing.assert_allclose(imagined.com_trajectory[0], estimated[2])
     from_views = predictor.imagine_batch(batch, start="estimated")
     np.testing.assert_allclose(from_views.com[2], imagined.com_trajectory, atol=1e-6)
-
-
-def test_an_empty_mask_is_refused(batch):
-    view = TopDownView(np.zeros((128, 128), dtype=bool), np.zeros((128, 128), dtype=np.float32))
-    with pytest.raises(PredictionError, match="empty"):
-        make(batch).imagine(view)
 
 
 def test_oracles_do_not_imagine_from_a_view(batch, registered):

@@ -8,10 +8,11 @@ import torch
 import tyro
 
 from factories import fake_batch, fake_interactions
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import ImaginedBatch
+from foretrace.imagined.context import CONSTANTS
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import TopDownView
@@ -81,15 +82,19 @@ def context_of(predictor: EffectPredictor) -> dict[str, float]:
     return {name: 0.6 for name in predictor.context}
 
 
+def with_parameters(batch: InteractionBatch, values: dict[str, float]) -> InteractionBatch:
+    columns = {name: np.full(len(batch), value) for name, value in values.items()}
+    return replace(batch, parameters=batch.parameters | columns)
+
+
 def doors(predictor: EffectPredictor, view: TopDownView) -> list[ImaginedBatch]:
     """One scene through all three doors."""
     context = context_of(predictor)
     seen = InteractionBatch.from_views([view])
-    seen = replace(seen, **{name: np.full(1, value) for name, value in context.items()})
+    seen = with_parameters(seen, context)
     return [
         predictor.imagine_batch(seen, "estimated"),
         predictor.imagine_candidates(view, [OWN], context=context),
-        predictor.imagine_batch(seen, "estimated"),
     ]
 
 
@@ -122,7 +127,7 @@ def test_shapes_frames_and_probabilities(predictor, batch):
 def test_batch_singles_and_candidates_are_the_same(predictor, batch):
     context = context_of(predictor)
     seen = InteractionBatch.from_views([view_of(batch, row) for row in range(len(batch))])
-    seen = replace(seen, **{name: np.full(len(seen), value) for name, value in context.items()})
+    seen = with_parameters(seen, context)
     whole = predictor.imagine_batch(seen, "estimated")
     for row in (0, 4, 9):
         one = predictor.imagine(view_of(batch, row), context=context)
@@ -197,16 +202,31 @@ def test_an_object_that_is_unusual_is_pointed_out_at_every_door(predictor):
         assert imagined.warnings == (one,)
 
 
-def test_a_path_that_is_not_nominal_is_pointed_out(predictor, batch):
-    far = replace(batch, sweep=np.full(len(batch), 0.5))
-    told = predictor.imagine_batch(far).warnings
+def test_a_path_that_is_not_nominal_is_pointed_out_at_every_door(predictor, batch):
+    action = replace(OWN, path=ToolPath(sweep=0.5).faster(1.2))
+    view = view_of(batch, 4)
+    context = {name: value for name, value in context_of(predictor).items() if name in CONSTANTS}
+    one = predictor.imagine(view, action, context=context)
+    names = {"sweep": 0.5, "speed": 1.2}
+    expected = [
+        f"{name} {value} is not the nominal {1 if name == 'speed' else 0.75}, and the predictor is not "
+        "conditioned on it"
+        for name, value in names.items()
+        if name not in predictor.context
+    ]
+    assert list(one.warnings) == expected
+    seen = with_parameters(InteractionBatch.from_views([view]), context | names)
+    assert predictor.imagine_batch(seen, "estimated").warnings == (one.warnings,)
+    candidates = predictor.imagine_candidates(view, [action, OWN], context=context)
+    assert candidates.warnings == (one.warnings, ())
+    np.testing.assert_allclose(candidates.com[0], one.com_trajectory, atol=2e-6)
+    steep = predictor.imagine(view, replace(OWN, path=ToolPath(pitch=0.35)), context=context).warnings
+    assert steep == ("pitch 0.35 is not the nominal 0.28, and the predictor is not conditioned on it",)
     if "sweep" in predictor.context:
-        assert told == ((),) * len(batch)
-    else:
-        assert len(told[3]) == 1
-        assert told[3][0].startswith(
-            "sweep 0.5 is not the nominal 0.75, and the predictor is not conditioned on"
-        )
+        with pytest.raises(
+            PredictionError, match=r"context sweep is 0.9, the action's path has 0.5: give one"
+        ):
+            predictor.imagine(view, action, context=context | {"sweep": 0.9})
 
 
 def test_the_beginning_of_a_motion_is_used_or_refused(predictor, batch):
@@ -222,7 +242,7 @@ def test_the_beginning_of_a_motion_is_used_or_refused(predictor, batch):
         return
     one = predictor.imagine(view, observed=ObservedMotion.of(effect, effect.times[11]), context=context)
     np.testing.assert_allclose(one.com_trajectory[:12], effect.com_trajectory[:12], atol=1e-9)
-    batch = replace(batch, **{name: np.full(len(batch), value) for name, value in context.items()})
+    batch = with_parameters(batch, context)
     many = predictor.imagine_batch(batch, observed=12)
     np.testing.assert_allclose(many.com[0], one.com_trajectory, atol=1e-5)
 

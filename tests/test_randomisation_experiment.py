@@ -12,23 +12,19 @@ from foretrace.errors import DatasetError, ResultsError
 from foretrace.evaluation.run import run_experiment
 from foretrace.experiments import randomisation
 from foretrace.experiments.randomisation import (
-    BARS,
-    KNOWING,
     NAMES,
-    NOMINAL,
-    PLAIN,
-    TESTS,
-    VARIED,
     RandomisationExperiment,
     Shown,
     distances,
     open_both,
     split_both,
 )
+from foretrace.experiments.randomisation_figures import BARS, KNOWING, NOMINAL, PLAIN, TESTS, VARIED
 from foretrace.experiments.training import Recipe
-from foretrace.experiments.transfer_objects import PENTAGON, Subject
+from foretrace.experiments.transfer_objects import Subject
 from foretrace.imagined import Futures, ImaginedBatch
 from foretrace.imagined.context import PARAMETERS
+from foretrace.objects.everyday import PENTAGON
 from foretrace.predictor import LstmConfig
 from foretrace.simulation.randomisation import RANDOMISED, VARIED_ACTION, Randomisation
 from foretrace.simulation.stand_in import StandIn
@@ -128,7 +124,9 @@ def test_the_context_is_the_stand_ins_constants_or_the_nominal_ones(shown, monke
     found = distances(predictor, shown)
     distances(predictor, shown, nominal=True)
     true, nominal = seen
-    np.testing.assert_allclose(true.parameters["friction"], [each.observed.perturbation.friction for each in shown])
+    np.testing.assert_allclose(
+        true.parameters["friction"], [each.observed.perturbation.friction for each in shown]
+    )
     factors = [each.observed.perturbation.density_factor for each in shown]
     np.testing.assert_allclose(true.parameters["density"], 700 * np.array(factors))
     assert nominal.parameters["friction"].tolist() == [0.8] * 3

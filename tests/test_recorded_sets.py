@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from foretrace.experiments.transfer_recorded import levered_edge
 
 from foretrace.cli import main
 from foretrace.errors import DatasetError
+from foretrace.experiments.transfer import levered_edge
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.recorded import NOTES_FOLDER, add_recorded, read_notes
 from foretrace.perception.recordings import open_recording
@@ -101,7 +101,7 @@ def test_recordings_get_the_tables_of_the_paper(
     command = ["evaluate", "transfer", "--recorded", str(recorded), "--out", str(tmp_path / "out")]
     assert main(command) == 0
     assert "| Recorded vs simulation, mean |" in capsys.readouterr().out
-    rows = pd.read_csv(tmp_path / "out" / "transfer.csv")
+    rows = pd.read_csv(tmp_path / "out" / "rows.csv")
     assert rows["interaction"].tolist() == [0, 1, 2]
     assert rows["repetition"].tolist() == [0, 1, 0]
     edges = [levered_edge(each) + 1 for each in Dataset.open(recorded)]
@@ -109,8 +109,7 @@ def test_recordings_get_the_tables_of_the_paper(
     # The film shows what the simulator does, but for how well it was seen; the prediction is another matter.
     assert rows["distance_simulated_cm"].between(1e-3, 0.2).all()
     assert (rows["distance_predicted_cm"] > rows["distance_simulated_cm"]).all()
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["predictor"] == "default"
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())["summary"]
     assert [sum(entry["outcomes"].values()) for entry in summary["edges"]] == [2, 1]
     assert {entry["group"] for entry in summary["edges"]} == {"recorded"}
     assert (tmp_path / "out" / "figure-14.png").stat().st_size > 1000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foretrace import cli
-from foretrace.actions import LeverUp, Screwdriver, ToolPath
+from foretrace.actions import LeverUp, Screwdriver, ToolPath, tool_transforms
 from foretrace.errors import RobotError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.record import Physics
@@ -20,7 +20,6 @@ from foretrace.robot.execution import WatchConfig, refuse_unready
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath, plan_approach, plan_lever_up, plan_retreat, read_base_pose
 from foretrace.simulation import arm
-from foretrace.simulation.engine import tip_transforms
 from foretrace.simulation.scene import build_scene
 from ur_controller import RunningController
 
@@ -36,7 +35,7 @@ def kinematics() -> ArmKinematics:
 
 @pytest.fixture(scope="module")
 def legs(kinematics) -> list[ArmPath]:
-    return plan_lever_up(kinematics, ACTION, T_TABLE_BASE, ToolPath(), 0.5)
+    return plan_lever_up(kinematics, ACTION, T_TABLE_BASE, 0.5)
 
 
 @pytest.fixture
@@ -66,7 +65,7 @@ def test_the_blade_follows_the_tool_path_on_the_table(legs):
     """With another library's forward kinematics, on a base that is turned, shifted and raised."""
     ur = pytest.importorskip("ur_analytic_ik")
     times = np.minimum(0.5 * legs[1].times, ToolPath().duration)
-    wanted = np.linalg.inv(ACTION.T_action_object) @ tip_transforms(ToolPath(), times)
+    wanted = np.linalg.inv(ACTION.T_action_object) @ tool_transforms(ACTION.tool_motion(times))
     flanges = np.array([ur.ur10.forward_kinematics(*q) for q in legs[1].joints])
     tips = T_TABLE_BASE @ flanges @ arm.T_flange_tip(Screwdriver())
     np.testing.assert_allclose(tips, wanted, atol=2e-5)
@@ -101,7 +100,7 @@ def test_the_retreat_sets_down_pulls_out_and_goes_up(kinematics, legs):
 
 
 def test_speed_scales_time_alone(kinematics, legs):
-    slow = plan_lever_up(kinematics, ACTION, T_TABLE_BASE, ToolPath(), 0.1)
+    slow = plan_lever_up(kinematics, ACTION, T_TABLE_BASE, 0.1)
     for fast_leg, slow_leg in zip(legs, slow, strict=True):
         same = slow_leg.joints[::5][: len(fast_leg.joints)]
         np.testing.assert_allclose(fast_leg.joints[: len(same)], same, atol=1e-6)
@@ -110,7 +109,7 @@ def test_speed_scales_time_alone(kinematics, legs):
 @pytest.mark.parametrize("degrees", [0, 225])
 def test_a_usual_lever_up_passes_all_checks(kinematics, degrees):
     direction = (np.cos(np.radians(degrees)), np.sin(np.radians(degrees)))
-    legs = plan_lever_up(kinematics, LeverUp((0.75, 0.1), direction), np.eye(4), ToolPath(), 1.0)
+    legs = plan_lever_up(kinematics, LeverUp((0.75, 0.1), direction), np.eye(4), 1.0)
     for leg in legs:
         assert failures(leg, kinematics) == {}
 
@@ -211,7 +210,7 @@ def test_a_base_pose_is_read(base_file):
 @pytest.mark.parametrize("speed", [0.0, -0.1, 1.1, np.nan])
 def test_a_wrong_speed_is_refused(kinematics, speed):
     with pytest.raises(RobotError, match="choose more than 0 and at most 1"):
-        plan_lever_up(kinematics, ACTION, T_TABLE_BASE, ToolPath(), speed)
+        plan_lever_up(kinematics, ACTION, T_TABLE_BASE, speed)
 
 
 def test_wrong_watch_settings_are_refused():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import PerceptionError, SimulationError
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.objects import Prism
@@ -124,7 +124,7 @@ PRISM = Prism([(0.09, -0.02), (0.05, 0.07), (-0.03, 0.08), (-0.09, 0.0), (-0.02,
 def film_first_frame(folder: Path, shadows: bool) -> tuple[np.ndarray, np.ndarray]:
     """Image and background."""
     usual = RecordingConfig()
-    short = 1.5 / usual.frames_per_second - usual.lead_time - usual.simulation.path.duration
+    short = 1.5 / usual.frames_per_second - usual.lead_time - ToolPath().duration
     faults = Faults(0.0, 0.0, 0.0)
     config = RecordingConfig(
         CAMERA, exposures=1, depth_every=0, tail_time=short, faults=faults, shadows=shadows, table="wooden"

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -173,8 +173,8 @@ def as_json(content: Any) -> Any:
     return json.loads(json.dumps(content))
 
 
-def short_hash(*parts: bytes) -> str:
-    """First 16 hexadecimal digits of a SHA-256 checksum."""
+def short_hash(parts: Iterable[bytes]) -> str:
+    """First 16 hexadecimal digits of the SHA-256 checksum of all parts, one after the other."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal
 
 from foretrace.errors import ActionError
@@ -106,7 +106,7 @@ class Screwdriver(Tool):
     """Distance from the tip to the handle's end in the holder [m]."""
 
     def __post_init__(self) -> None:
-        check_ranges("tool", self, dict.fromkeys(asdict(self), (1e-4, 0.5)))
+        check_ranges("tool", self, dict.fromkeys((field.name for field in fields(self)), (1e-4, 0.5)))
         if self.blade_length >= self.length:
             raise ActionError(
                 f"tool: blade_length = {self.blade_length} m does not fit in length = {self.length} m"

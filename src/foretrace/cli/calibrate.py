@@ -44,14 +44,7 @@ def calibrate(
         raise PerceptionError("--refine CAMERA and --markers LAYOUT go together: give both, or neither")
     out.parent.mkdir(parents=True, exist_ok=True)
     if refine is not None and markers is not None:
-        taken = list(read_images(images).values())
-        name = (layout := MarkerLayout.load(markers)).dictionary
-        seen = [align_patterns(image, detect_markers(image, name), name) for image in taken]
-        camera, error = refine_camera(seen, layout.table, PinholeCamera.load(refine))
-        camera.save(out, error_pixels=error, images=len(seen))
-        print(f"focal lengths {camera.fx:.1f} and {camera.fy:.1f} pixels")
-        print(f"error {error:.3f} pixels over {len(seen)} images")
-        print(out)
+        _refine(images, refine, markers, out)
         return
     found = calibrate_camera(read_images(images), board)
     for name, error in found.errors.items():
@@ -64,4 +57,20 @@ def calibrate(
         f"focal lengths {camera.fx:.1f} and {camera.fy:.1f}, centre {camera.cx:.1f}, {camera.cy:.1f} pixels"
     )
     print(f"error {found.error:.3f} pixels over {len(found.errors)} images")
+    print(out)
+
+
+def _refine(images: tuple[Path, ...], stated: Path, markers: Path, out: Path) -> None:
+    """Adjust a camera file to images of the table's markers."""
+    from foretrace.perception.calibration import read_images
+
+    layout = MarkerLayout.load(markers)
+    name = layout.dictionary
+    seen = [
+        align_patterns(image, detect_markers(image, name), name) for image in read_images(images).values()
+    ]
+    camera, error = refine_camera(seen, layout.table, PinholeCamera.load(stated))
+    camera.save(out, error_pixels=error, images=len(seen))
+    print(f"focal lengths {camera.fx:.1f} and {camera.fy:.1f} pixels")
+    print(f"error {error:.3f} pixels over {len(seen)} images")
     print(out)

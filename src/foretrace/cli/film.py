@@ -56,7 +56,7 @@ def film(
         if not 0 <= value <= most:
             raise SimulationError(f"--{option} is {value}: give a number from 0 to {most}")
     dataset = Dataset.open(data)
-    rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
+    rows = np.flatnonzero(dataset.index["id"].to_numpy() == id)
     if len(rows) == 0:
         raise DatasetError(
             f"{data} has no interaction {id} with a motion: `foretrace data` counts what it has"

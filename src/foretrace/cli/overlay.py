@@ -44,7 +44,7 @@ def overlay(
     if out.suffix.lower() != ".mp4":
         raise PerceptionError(f"cannot write a video to {out}: choose a name that ends in .mp4")
     dataset = Dataset.open(data)
-    rows = np.flatnonzero(dataset.table["id"].to_numpy() == id)
+    rows = np.flatnonzero(dataset.index["id"].to_numpy() == id)
     notes = read_notes(data, id)
     if len(rows) == 0:
         raise DatasetError(f"{data} has no recording {id}: give a data set that `foretrace import` made")

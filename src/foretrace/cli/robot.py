@@ -63,7 +63,7 @@ def robot(
         raise RobotError("--execute needs --host, the controller's address")
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
-    legs = plan_lever_up(kinematics, LeverUp(contact, direction), T_table_base, path, speed)
+    legs = plan_lever_up(kinematics, LeverUp(contact, direction, path), T_table_base, speed)
     legs += plan_retreat(legs) if retreat else []
     postures = [kinematics.along(leg.joints) for leg in legs]
     checks = [

@@ -7,7 +7,7 @@ the help. How trials are run, kept and resumed is the same for all of them: `for
 import json
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, get_type_hints
@@ -57,7 +57,7 @@ class Trial:
     def key(self) -> str:
         """Name of the trial's file: readable, safe in every file system, and unique."""
         words = "-".join(re.sub(r"[^A-Za-z0-9.]+", "_", str(value)) for value in self.settings.values())
-        return f"{words[:80]}.{short_hash(json.dumps(self.settings).encode())[:8]}"
+        return f"{words[:80]}.{short_hash([json.dumps(self.settings).encode()])[:8]}"
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {value}" for name, value in self.settings.items())
@@ -122,8 +122,8 @@ class Experiment(ABC):
         """
 
     @abstractmethod
-    def run(self, trial: Any, folder: Path) -> Sequence[Row]:
-        """Carry out one trial, in whatever process.
+    def run(self, trial: Any, folder: Path) -> Iterable[Row]:
+        """Carry out one trial, in whatever process; returns its rows.
 
         Args:
             trial: The trial.

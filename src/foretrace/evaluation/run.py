@@ -189,7 +189,7 @@ class _Work:
             with warnings.catch_warnings(), _threads(self.threads):
                 if os.getpid() != self.parent:
                     warnings.simplefilter("ignore")  # the parent has warned about the data
-                rows = experiment.run(trial, self.store.folder)
+                rows = list(experiment.run(trial, self.store.folder))
             seconds = time.perf_counter() - started
             self.store.save(trial, rows, seconds)
         except ForetraceError as error:

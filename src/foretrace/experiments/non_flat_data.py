@@ -66,7 +66,7 @@ class NonFlatData:
                 f"{path} has too few objects that look alike, three outlines are needed at least: simulate more with "
                 "foretrace simulate --recipe mixed"
             )
-        places = zip(*(dataset.table[name].to_pylist() for name in ("contact", "direction")), strict=True)
+        places = zip(*(dataset.index[name].to_pylist() for name in ("contact", "direction")), strict=True)
         rounded = [tuple(np.round([*contact, *direction], 6)) for contact, direction in places]
         batch = dataset.batch()
         if not known_heights:

@@ -95,7 +95,9 @@ class Paper(Experiment):
                 f"{self.data} has {found} levered interactions, the paper's comparisons need {sum(PAPER_SIZES)}: "
                 "simulate more objects, or take the same proportions of what there is (--proportional)"
             )
-        recipes = {name: self._recipe(name).describe() for name in PREDICTORS}
+        # Those of foretrace itself: a package that adds a predictor must not make a table another one.
+        own = [name for name, kind in PREDICTORS.items() if kind.__module__.startswith("foretrace.")]
+        recipes = {name: self._recipe(name).describe() for name in own}
         options = {label: dict(chosen) for label, chosen in self.feature_options.items()}
         recipe = {"predictors": recipes, "feature_options": options, "proportional": self.proportional}
         return {"data": fingerprint(self._levered), "recipe": recipe}

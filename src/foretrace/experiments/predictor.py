@@ -60,7 +60,7 @@ class Predictor(Experiment):
         """The weights, and the interactions."""
         read_json(self.run_folder / "config.json", CheckpointError, "give the folder of a training")
         model = self.run_folder / "model.safetensors"
-        weights = short_hash(model.read_bytes()) if model.is_file() else None
+        weights = short_hash([model.read_bytes()]) if model.is_file() else None
         return {"model": weights, "data": fingerprint(self._batch)}
 
     def run(self, trial: PartTrial, folder: Path) -> Sequence[Row]:

@@ -67,7 +67,7 @@ class ReplayExperiment(Experiment):
 
     def identity(self) -> dict[str, Any]:
         """The files, engine and time step."""
-        files = [short_hash(file.read_bytes()) for file in self.recordings]
+        files = [short_hash([file.read_bytes()]) for file in self.recordings]
         return {"recordings": files, "engine": self.engine, "timestep_s": self.timestep}
 
     def run(self, trial: RecordingTrial, folder: Path) -> Sequence[Row]:

@@ -120,4 +120,4 @@ def load_levered(data: str | Path) -> InteractionBatch:
 def weights_of(run: Path | None) -> str | None:
     """A checksum of a trained predictor's weights; None stands for the predictor that comes with foretrace."""
     folder = default_checkpoint() if run is None else run
-    return short_hash((folder / MODEL).read_bytes()) if (folder / MODEL).is_file() else None
+    return short_hash([(folder / MODEL).read_bytes()]) if (folder / MODEL).is_file() else None

@@ -218,7 +218,7 @@ class Transfer(Experiment):
         """Recordings by object and levered edge; those at one edge of one object count as repetitions."""
         found: dict[TransferTrial, list[Interaction]] = {}
         for interaction, number in zip(
-            self._dataset, self._dataset.table["object_id"].to_pylist(), strict=True
+            self._dataset, self._dataset.index["object_id"].to_pylist(), strict=True
         ):
             if interaction.provenance.source != "recorded":
                 raise DatasetError(

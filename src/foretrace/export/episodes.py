@@ -82,7 +82,7 @@ def choose_by_part(
     parts = {} if run is None else parts_of(run, Dataset.open(data))
     part_of_id = {id: name for name, members in parts.items() for id in members}
     names = [*parts, REST] if parts else ["train"]
-    mine = [part_of_id.get(int(id), names[-1]) for id in chosen.dataset.table["id"].to_numpy()]
+    mine = [part_of_id.get(int(id), names[-1]) for id in chosen.dataset.index["id"].to_numpy()]
     order = sorted(range(len(mine)), key=lambda row: names.index(mine[row]))
     ends = np.cumsum([mine.count(name) for name in names]).tolist()
     ranges = {name: range(end - mine.count(name), end) for name, end in zip(names, ends, strict=True)}
@@ -104,7 +104,7 @@ def choose(data: Path, ids: Sequence[int] | None = None, run: Path | None = None
         PredictionError: The predictor's features are only known after the action.
     """
     dataset = Dataset.open(data)
-    known = dataset.table["id"].to_numpy()
+    known = dataset.index["id"].to_numpy()
     ids = known.tolist() if ids is None else list(dict.fromkeys(ids))
     if not ids:
         raise ExportError(f"nothing to export: no interaction of {data} is chosen, name some with --ids")

@@ -153,7 +153,7 @@ class AutoencoderFeatures(FeatureExtractor, abstract=True):
         return torch.cat([convolve_windows(part, encode, channels) for part in inputs.split(ROWS_AT_ONCE)])
 
     def _loss(self, images: Tensor, reduced: bool = False) -> Tensor:
-        """Mean over the pixels of the images; those beside the windows are told right without being looked at."""
+        """Mean over the pixels of the images; those beside the windows count as restored."""
         total = torch.zeros((), device=images.device)
         for part in find_windows(images):
             target = crop(images, part).float()

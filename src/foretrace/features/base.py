@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from foretrace.errors import TrainingError
 from foretrace.interactions.candidates import Candidates
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.registry import Registry, adds_anything
 
 Option = bool | int | float | str
@@ -40,9 +40,14 @@ class FitPart:
     """One part of the data as a feature extractor's own training sees it."""
 
     inputs: Tensor
-    """What ``inputs`` made of ``batch``, on the device to train on."""
-    batch: InteractionBatch
-    """The interactions themselves, for extractors that learn from observed effects."""
+    """Inputs of the features, on the device to train on."""
+    source: InteractionBatch | Dataset
+    """The interactions."""
+
+    @property
+    def batch(self) -> InteractionBatch:
+        """The interactions as arrays, for extractors that learn from observed effects."""
+        return self.source if isinstance(self.source, InteractionBatch) else self.source.batch()
 
 
 class TracedFeatures(nn.Module, ABC):
@@ -176,7 +181,7 @@ def make_features(label: str, **options: Option) -> FeatureExtractor:
 
 
 class NoFeatures(FeatureExtractor):
-    """The paper's baseline: the predictor is told nothing of the object but where it lies (section 5.2)."""
+    """The paper's baseline: the predictor is given nothing of the object but where it lies (section 5.2)."""
 
     label = "none"
 

@@ -296,11 +296,11 @@ class PredictedSupportPoints(FeatureExtractor):
                 "points: add levered ones, or use sp-rule, which learns nothing"
             )
         held_out = self._observed(validation)
-        judged = held_out if len(held_out[0]) else (corners, points)
+        chosen_by = held_out if len(held_out[0]) else (corners, points)
         fit_network(
             self.network,
             lambda rows: F.mse_loss(self.network(corners[rows]), points[rows]),
-            lambda: F.mse_loss(self.network(judged[0]), judged[1]).item(),
+            lambda: F.mse_loss(self.network(chosen_by[0]), chosen_by[1]).item(),
             len(corners),
             self.config,
             name=self.label,

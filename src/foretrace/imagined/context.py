@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +29,8 @@ PARAMETERS = {
 """Parameters of the action's path by name."""
 CONTEXT = CONSTANTS | PARAMETERS
 """Everything that a predictor may be conditioned on."""
+TIMED = ("insert_time", "lift_time")
+"""Times of a path that its parameter ``speed`` scales."""
 SAME = 1e-9
 """Values of a parameter that differ by less are the same."""
 
@@ -48,15 +51,32 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
 
 @cache
 def nominal_parameters() -> Mapping[str, float]:
-    """Parameters of the nominal path."""
-    return MappingProxyType(LeverUp.nominal_parameters())
+    """Parameters and further settings of the nominal path."""
+    return _settings(LeverUp((0.0, 0.0), (1.0, 0.0)))
 
 
 def parameters_of(actions: Sequence[Action]) -> dict[str, Float[np.ndarray, " n"]]:
-    """Parameters of the actions' paths, by name; NaN where an action has no such one."""
-    found = [action.parameters() for action in actions]
-    names = dict.fromkeys(name for parameters in found for name in parameters)
-    return {name: np.array([parameters.get(name, np.nan) for parameters in found]) for name in names}
+    """Parameters and further settings of the actions' paths, by name; NaN where an action has no such one."""
+    kinds: dict[tuple[type[Action], Any], Mapping[str, float]] = {}
+    found = []
+    for action in actions:
+        key = type(action), action.path
+        if key not in kinds:
+            kinds[key] = _settings(action)
+        found.append(kinds[key])
+    names = dict.fromkeys(name for settings in kinds.values() for name in settings)
+    return {name: np.array([settings.get(name, np.nan) for settings in found]) for name in names}
+
+
+def _settings(action: Action) -> Mapping[str, float]:
+    """Parameters of an action's path, and its other settings; times that the speed scales, at the nominal speed."""
+    parameters = action.parameters()
+    further = {
+        name: value * parameters.get("speed", 1.0) if name in TIMED else value
+        for name, value in vars(action.path).items()
+        if name not in parameters
+    }
+    return MappingProxyType(parameters | further)
 
 
 def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
@@ -149,7 +169,7 @@ def find_unconditioned(
     nominal, number = nominal_parameters(), len(next(iter(parameters.values())))
     warnings: list[list[str]] = [[] for _ in range(number)]
     for name, values in parameters.items():
-        if name in names:
+        if name in names or name not in nominal:
             continue
         for row in np.flatnonzero(np.abs(values - nominal[name]) > SAME):
             warnings[row].append(

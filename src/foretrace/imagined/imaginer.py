@@ -80,7 +80,7 @@ class Imaginer(ABC):
         Args:
             view: The object from above, in the action frame.
             action: The action. Its path's parameters are context; a path that is not nominal is pointed out if the
-                imaginer is not conditioned on it. Where it acts is told by the view's frame. None: the nominal path.
+                imaginer is not conditioned on it. The view's frame says where it acts. None: the nominal path.
             context: Values of the variables that the imaginer is conditioned on, by name [SI].
             observed: Beginning of the motion, where it is under way: the record's own `Effect`, or poses with times.
             com: The centre of mass at rest in the action frame [m]. By default that of the observed motion, or the one

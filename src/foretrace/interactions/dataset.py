@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import ACTIONS, FAILED, action_transform
@@ -21,6 +22,19 @@ from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
+
+CACHE_BYTES = 256 * 2**20
+"""A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
+ROWS_AT_ONCE = 500
+"""Interactions that are read together where a data set is gone through."""
+MOST_OBJECTS = 2000
+"""Objects that are kept built."""
+INDEX_COLUMNS = [
+    field.name
+    for field in storage.SCHEMA
+    if field.name not in (*storage.TRAJECTORIES, "joint_trajectory", "mask", "height", "object")
+]
+"""Columns that are always in memory: some 600 bytes a row."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +81,11 @@ class InteractionBatch:
         }
         parameters = {name: values[rows] for name, values in self.parameters.items()}
         return replace(self, **kept, parameters=parameters)
+
+    def batches(self, size: int | None = None) -> Iterator["InteractionBatch"]:
+        """The same in parts of a number of rows, in order; by default in one."""
+        size = size or max(1, len(self))
+        return (self[start : start + size] for start in range(0, len(self), size))
 
     @classmethod
     def from_interactions(cls, interactions: Sequence[Interaction]) -> "InteractionBatch":
@@ -122,20 +141,24 @@ class Dataset:
     """Interactions in the order of their ids; open one with `Dataset.open`.
 
     ``dataset[3]`` is the fourth interaction; ``dataset[10:20]`` and ``dataset[indices]`` are data sets again.
+
+    Images and trajectories are read from disk when they are needed, and kept in memory if all fit into
+    `CACHE_BYTES`: a data set may be larger than memory, as long as it is read by iteration or by `batches`.
     """
 
-    def __init__(self, table: pa.Table, manifest: Mapping[str, Any], path: Path):
-        self.table = table
-        """The rows as a pyarrow table; `storage.COLUMNS` explains its columns."""
+    def __init__(self, shards: "_Shards", index: pa.Table, places: np.ndarray, manifest: Mapping[str, Any]):
+        self.index = index
+        """Columns of a few numbers a row, as a pyarrow table; `storage.COLUMNS` explains them."""
         self.manifest = manifest
-        """What the folder says about itself: configuration, versions, units, shards."""
-        self.path = path
+        """Configuration, versions, units and shards of the folder."""
+        self.path = shards.path
         """The folder that it was read from."""
+        self._shards, self._places = shards, places
         self._objects: dict[str, ObjectModel] = {}
 
     @classmethod
     def open(cls, path: str | Path, failed: bool = False) -> "Dataset":
-        """Read a data set, whole, into memory; checksums are verified on the way.
+        """Open a data set; checksums of all shards are verified.
 
         Args:
             path: The folder written by ``foretrace simulate``.
@@ -146,30 +169,45 @@ class Dataset:
         """
         path = Path(path)
         manifest = storage.read_manifest(path)
-        shards = sorted(manifest["shards"].items())
-        tables = [storage.read_shard(path, name, entry.get("sha256"))[0] for name, entry in shards]
+        shards = _Shards(path, {name: entry.get("sha256") for name, entry in manifest["shards"].items()})
         if missing := storage.missing_shards(manifest):
             warnings.warn(
                 f"{path} is not finished: {len(missing)} of {len(missing) + len(shards)} shards are missing; "
                 "the same `foretrace simulate` command goes on where it stopped",
                 stacklevel=2,
             )
-        dataset = cls(pa.concat_tables([storage.SCHEMA.empty_table(), *tables]), manifest, path)
+        tables = [shards.table(number, INDEX_COLUMNS) for number in range(len(shards))]
+        places = np.array(
+            [(number, row) for number, table in enumerate(tables) for row in range(table.num_rows)],
+            dtype=np.int64,
+        )
+        empty = storage.SCHEMA.empty_table().select(INDEX_COLUMNS)
+        dataset = cls(shards, pa.concat_tables([empty, *tables]), places.reshape(-1, 2), manifest)
         return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
 
+    def __repr__(self) -> str:
+        outcomes = ", ".join(f"{count} {outcome}" for outcome, count in self.outcomes().items())
+        return f"Dataset({str(self.path)!r}: {len(self)} interactions{f': {outcomes}' if outcomes else ''})"
+
     def __len__(self) -> int:
-        return self.table.num_rows
+        return len(self._places)
 
     def __getitem__(self, rows: Any) -> Any:
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):
                 raise IndexError(f"interaction {rows} of {len(self)}")
-            row = self.table.slice(rows % len(self), 1).to_pylist()[0]
-            return storage.decode(row, self._object(row["object"]))
+            number, row = self._places[rows]
+            return self._decode(self._shards.table(int(number)).slice(row, 1).to_pylist()[0])
         return self._view(np.arange(len(self))[rows])
 
     def __iter__(self) -> Iterator[Interaction]:
-        return (self[k] for k in range(len(self)))
+        for start in range(0, len(self), ROWS_AT_ONCE):
+            yield from map(self._decode, self._rows(slice(start, start + ROWS_AT_ONCE)).to_pylist())
+
+    @property
+    def table(self) -> pa.Table:
+        """All columns of all rows, in memory; `storage.COLUMNS` explains them."""
+        return self._rows(slice(None))
 
     def where(self, **conditions: Any) -> "Dataset":
         """The interactions that meet every condition.
@@ -203,7 +241,7 @@ class Dataset:
         Raises:
             DatasetError: It is not among these.
         """
-        found = np.flatnonzero(self.table["id"].to_numpy() == id)
+        found = np.flatnonzero(self.index["id"].to_numpy() == id)
         if len(found) == 0:
             raise DatasetError(f"{self.path} has no interaction {id} among the {len(self)} selected")
         return self[found[0]]
@@ -214,9 +252,49 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
-        for description in self.table["object"].unique().to_pylist():
-            self._object(description)
-        return _batch(self.table, self._objects)
+        return self._batch(self.table, self.times)
+
+    def batches(self, size: int = ROWS_AT_ONCE) -> Iterator[InteractionBatch]:
+        """All of them as arrays, a number of rows at a time; sample times are common to all.
+
+        Raises:
+            DatasetError: Two of them were sampled at different times.
+        """
+        for start in range(0, len(self), size):
+            yield self._batch(self._rows(slice(start, start + size)), self.times)
+
+    @property
+    def ids(self) -> Int[np.ndarray, " batch"]:
+        """Number of each interaction within its data set."""
+        return self.index["id"].to_numpy()
+
+    @cached_property
+    def lengths(self) -> Int[np.ndarray, " batch"]:
+        """Number of samples of each trajectory."""
+        parts = [
+            pc.list_value_length(  # pyright: ignore[reportAttributeAccessIssue]
+                self._rows(slice(start, start + ROWS_AT_ONCE), ["times"])["times"]
+            ).to_numpy()
+            for start in range(0, len(self), ROWS_AT_ONCE)
+        ]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *parts]).astype(np.int64)
+
+    @cached_property
+    def times(self) -> Float[np.ndarray, " time"]:
+        """Sample times [s] of the longest interaction, with which all others agree.
+
+        Raises:
+            DatasetError: Two of them were sampled at different times.
+        """
+        found: dict[bytes, tuple[int, np.ndarray]] = {}  # an interaction of each kind of times
+        for start in range(0, len(self), ROWS_AT_ONCE):
+            table = self._rows(slice(start, start + ROWS_AT_ONCE), ["id", "times"])
+            for id, row in zip(table["id"].to_pylist(), _lists(table, "times", 1), strict=True):
+                found.setdefault(row.tobytes(), (id, row[:, 0].copy()))
+        longest = max((row for _, row in found.values()), key=len, default=np.zeros(0))
+        for id, row in found.values():
+            _check_times(id, row, longest)
+        return longest
 
     def to_pandas(self) -> pd.DataFrame:
         """The rows as a data frame, trajectories flattened, images packed."""
@@ -224,40 +302,101 @@ class Dataset:
 
     def outcomes(self) -> dict[str, int]:
         """Number of interactions with each outcome that occurs, in the order in which actions name them."""
-        return count_outcomes(self.table["outcome"].to_pylist())
+        return count_outcomes(self.index["outcome"].to_pylist())
+
+    def objects(self) -> Iterator[dict[str, Any]]:
+        """Descriptions of the objects, row by row, as of ``ObjectModel.to_dict``."""
+        for start in range(0, len(self), ROWS_AT_ONCE):
+            for text in self._rows(slice(start, start + ROWS_AT_ONCE), ["object"])["object"].to_pylist():
+                yield json.loads(text)
 
     def _outcome_names(self) -> list[str]:
         """Outcomes that its actions can have, and any other that it holds."""
         known = [
             name
-            for label in self.table["action"].unique().to_pylist()
+            for label in self.index["action"].unique().to_pylist()
             for name in ACTIONS.find(label).outcomes
         ]
-        return list(dict.fromkeys([*known, FAILED, *self.table["outcome"].unique().to_pylist()]))
+        return list(dict.fromkeys([*known, FAILED, *self.index["outcome"].unique().to_pylist()]))
 
     def _column(self, name: str) -> np.ndarray:
         """A column of single values, or a parameter of the actions."""
         scalars = [f.name for f in storage.SCHEMA if not pa.types.is_nested(f.type)]
         if name in scalars:
-            return self.table[name].to_numpy()
-        if name not in self._parameters:
-            names = ", ".join([*scalars, *self._parameters])
+            table = self.index if name in INDEX_COLUMNS else self._rows(slice(None), [name])
+            return table[name].to_numpy()
+        if name not in self.parameters:
+            names = ", ".join([*scalars, *self.parameters])
             raise DatasetError(f"no column {name!r} to filter by; there are {names}")
-        return self._parameters[name]
+        return self.parameters[name]
 
     @cached_property
-    def _parameters(self) -> dict[str, np.ndarray]:
-        return storage.parameter_values(self.table)
+    def parameters(self) -> dict[str, np.ndarray]:
+        """Parameters of the actions by name [SI], one number a row; NaN where an action lacks one."""
+        return storage.parameter_values(self.index)
 
     def _view(self, rows: np.ndarray) -> "Dataset":
-        view = Dataset(self.table.take(pa.array(rows, type=pa.int64())), self.manifest, self.path)
+        index = self.index.take(pa.array(rows, type=pa.int64()))
+        view = Dataset(self._shards, index, self._places[rows], self.manifest)
         view._objects = self._objects
+        if "times" in self.__dict__:  # common to all that come from the same data set
+            view.__dict__["times"] = self.times
         return view
+
+    def _rows(self, chosen: slice, columns: list[str] | None = None) -> pa.Table:
+        """Rows with all or some columns, in the data set's order."""
+        names = storage.SCHEMA.names if columns is None else columns
+        places = self._places[chosen]
+        starts = np.flatnonzero(np.diff(places[:, 0], prepend=-1))
+        parts = [
+            self._shards.table(int(run[0, 0]), columns).take(pa.array(run[:, 1]))
+            for run in np.split(places, starts[1:])
+            if len(run)
+        ]
+        return pa.concat_tables([storage.SCHEMA.empty_table().select(names), *parts])
+
+    def _batch(self, table: pa.Table, times: np.ndarray) -> InteractionBatch:
+        for description in table["object"].unique().to_pylist():
+            self._object(description)
+        return _batch(table, self._objects, times)
+
+    def _decode(self, row: dict[str, Any]) -> Interaction:
+        return storage.decode(row, self._object(row["object"]))
 
     def _object(self, description: str) -> ObjectModel:
         if description not in self._objects:
+            if len(self._objects) >= MOST_OBJECTS:
+                self._objects.clear()
             self._objects[description] = object_from_dict(json.loads(description))
         return self._objects[description]
+
+
+class _Shards:
+    """Tables of a data set's shards, kept in memory if all of them fit; otherwise only the last one that was read."""
+
+    def __init__(self, path: Path, checksums: Mapping[str, str | None]):
+        self.path = path
+        self._checksums = sorted(checksums.items())
+        self._kept: dict[int, pa.Table] = {}
+
+    def __len__(self) -> int:
+        return len(self._checksums)
+
+    def table(self, number: int, columns: list[str] | None = None) -> pa.Table:
+        """The rows of a shard, with all or some of its columns.
+
+        Raises:
+            DatasetError: It is missing or corrupt.
+        """
+        table = self._kept.get(number)
+        if table is None:
+            name, checksum = self._checksums[number]
+            table = storage.read_shard(self.path, name, checksum, columns=columns)[0]
+            if columns is None:
+                if table.nbytes * len(self) > CACHE_BYTES:
+                    self._kept.clear()
+                self._kept[number] = table
+        return table if columns is None else table.select(columns)
 
 
 def count_outcomes(outcomes: Sequence[str]) -> dict[str, int]:
@@ -291,15 +430,9 @@ def _lists(table: pa.Table, name: str, width: int) -> list[np.ndarray]:
     return [flat[a:b].reshape(-1, width) for a, b in pairwise(offsets)]
 
 
-def _common_times(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
-    """The longest row's sample times, and how many samples each row has."""
-    times = [row[:, 0] for row in _lists(table, "times", 1)]
-    length = np.array([len(row) for row in times], dtype=np.int64)
-    longest = max(times, key=len, default=np.zeros(0)).copy()
-    for id, row in zip(table["id"].to_pylist(), times, strict=True):
-        if not np.allclose(row, longest[: len(row)], rtol=0, atol=1e-9):
-            raise DatasetError(f"interaction {id} was sampled at other times than the rest; batch it apart")
-    return longest, length
+def _check_times(id: int, times: np.ndarray, longest: np.ndarray) -> None:
+    if not np.allclose(times, longest[: len(times)], rtol=0, atol=1e-9):
+        raise DatasetError(f"interaction {id} was sampled at other times than the rest; batch it apart")
 
 
 def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:
@@ -314,8 +447,15 @@ def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> l
     return corners
 
 
-def _batch(table: pa.Table, objects: Mapping[str, ObjectModel]) -> InteractionBatch:
-    times, length = _common_times(table)
+def _batch(
+    table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndarray | None = None
+) -> InteractionBatch:
+    rows = [row[:, 0] for row in _lists(table, "times", 1)]
+    if times is None:
+        times = max(rows, key=len, default=np.zeros(0)).copy()
+        for id, row in zip(table["id"].to_pylist(), rows, strict=True):
+            _check_times(id, row, times)
+    length = np.array([len(row) for row in rows], dtype=np.int64)
     corners = _corners_in_action(table, objects)
     slip_index = table["slip_index"].to_numpy()
     constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}

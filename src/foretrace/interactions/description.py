@@ -1,6 +1,5 @@
 """What is in a data set, in a few figures."""
 
-import json
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import numpy as np
 from foretrace.geometry import quaternion_to_matrix, support_edge, tilt
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
-from foretrace.interactions.storage import parameter_values
 
 CM, MM = 100.0, 1000.0
 VARIABLE = ("density", "friction", "tool_friction", "execution_ahead", "execution_left", "execution_turn")
@@ -32,20 +30,19 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         observed support corners) and ``rule_agreement`` (share of those whose corners the closed-form rule of
         ``geometry.support_edge`` names).
     """
-    levered = dataset[dataset.table["outcome"].to_numpy() == Outcome.LEVERED]
-    rows = [_describe(levered[k]) for k in range(len(levered))]
-    objects = [json.loads(text) for text in dataset.table["object"].to_pylist()]
-    kinds = np.array([obj["kind"] for obj in objects])
+    outcome = dataset.index["outcome"].to_numpy()
+    rows = [_describe(interaction) for interaction in dataset[outcome == Outcome.LEVERED]]
+    shapes = [(obj["kind"], obj.get("height"), obj.get("bevel")) for obj in dataset.objects()]
+    kinds = np.array([kind for kind, _, _ in shapes])
     figures: dict[str, Any] = {
         "outcomes": dataset.outcomes(),
         "outcomes_by_kind": {str(kind): dataset[kinds == kind].outcomes() for kind in np.unique(kinds)},
         "interactions": len(dataset),
-        "varies": _ranges(dataset, objects),
-        "fell_off_the_table": dataset.table["fall_index"].drop_null().length(),
+        "varies": _ranges(dataset, shapes),
+        "fell_off_the_table": dataset.index["fall_index"].drop_null().length(),
     }
-    if rolled := list(dataset[dataset.table["outcome"].to_numpy() == Outcome.ROLLED]):
-        paths = [interaction.effect.com_trajectory[:, :2] for interaction in rolled]
-        distances = [np.linalg.norm(path[-1] - path[0]) for path in paths]
+    rolled = (interaction.effect.com_trajectory[:, :2] for interaction in dataset[outcome == Outcome.ROLLED])
+    if distances := [np.linalg.norm(path[-1] - path[0]) for path in rolled]:
         figures["median_rolled_cm"] = float(CM * np.median(distances))
     if not rows:
         return figures
@@ -60,11 +57,11 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _ranges(dataset: Dataset, objects: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
+def _ranges(dataset: Dataset, shapes: list[tuple[str, float | None, Any]]) -> dict[str, tuple[float, float]]:
     """Least and greatest value of each quantity that is not the same in all interactions."""
-    columns = {name: dataset.table[name].to_numpy() for name in VARIABLE} | parameter_values(dataset.table)
-    columns["height"] = np.array([obj["height"] for obj in objects if "height" in obj])
-    bevels = np.array([obj["bevel"] for obj in objects if "bevel" in obj]).reshape(-1, 2)
+    columns = {name: dataset.index[name].to_numpy() for name in VARIABLE} | dataset.parameters
+    columns["height"] = np.array([height for _, height, _ in shapes if height is not None])
+    bevels = np.array([bevel for _, _, bevel in shapes if bevel is not None]).reshape(-1, 2)
     columns["bevel_width"], columns["bevel_height"] = bevels.T
     return {
         name: (float(values.min()), float(values.max()))

@@ -69,7 +69,7 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
         id = manifest["num_trials"]
         objects = manifest.setdefault(OBJECTS, {})
         described = json.dumps(interaction.object.to_dict())
-        object_id = objects.setdefault(short_hash(described.encode()), len(objects))
+        object_id = objects.setdefault(short_hash([described.encode()]), len(objects))
         table = storage.to_table([storage.encode(replace(interaction, id=id), object_id)])
         path = folder / NOTES_FOLDER / f"{id:05d}.json"
         write_json(path, dict(notes))
@@ -82,4 +82,4 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
 
 def numbered(objects: Mapping[str, int]) -> dict[str, int]:
     """The manifest's entry `OBJECTS` from numbers of objects by their descriptions."""
-    return {short_hash(description.encode()): number for description, number in objects.items()}
+    return {short_hash([description.encode()]): number for description, number in objects.items()}

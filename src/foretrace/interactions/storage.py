@@ -90,6 +90,8 @@ ACTION_COLUMNS = ("action", "contact", "direction", "path", "tool")
 PROVENANCE_COLUMNS = tuple(field.name for field in fields(Provenance) if field.name != "versions")
 EXECUTION = "execution_"
 """Beginning of the columns of an `ExecutionOffset`."""
+_HEIGHTS = (np.arange(65536) * HEIGHT_STEP).astype(np.float32)
+"""Height of each number of steps [m]; 200 steps are 0.02 exactly."""
 SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items()])
 TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
 """Numbers per sample of each trajectory column; the joints' count is a column of its own."""
@@ -205,8 +207,7 @@ def unpack_masks(packed: Sequence[bytes]) -> np.ndarray:
 def unpack_heights(packed: Sequence[bytes]) -> np.ndarray:
     """(n, 128, 128) float32 height maps [m] from their stored form."""
     steps = np.frombuffer(b"".join(packed), dtype="<u2")
-    lookup = (np.arange(65536) * HEIGHT_STEP).astype(np.float32)  # 200 steps are 0.02 exactly
-    return lookup[steps].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
+    return _HEIGHTS[steps].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
 
 
 def to_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
@@ -235,7 +236,11 @@ def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
 
 
 def read_shard(
-    folder: Path, name: str, sha256: str | None = None, schema: pa.Schema | None = SCHEMA
+    folder: Path,
+    name: str,
+    sha256: str | None = None,
+    schema: pa.Schema | None = SCHEMA,
+    columns: Sequence[str] | None = None,
 ) -> tuple[pa.Table, bytes]:
     """A shard as a table, and its bytes.
 
@@ -244,6 +249,7 @@ def read_shard(
         name: The shard's name in the manifest.
         sha256: The checksum that it must have, or None to accept any.
         schema: The schema that it must have, or None to accept any.
+        columns: Columns to read; all by default.
 
     Raises:
         DatasetError: The file is missing, damaged, or of another schema.
@@ -258,12 +264,14 @@ def read_shard(
         raise DatasetError(f"shard {path} is corrupt: its checksum is not the manifest's; {remedy}")
     try:
         # In this thread: another may let go of Python's bytes later than the interpreter can bear, when it ends.
-        table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
+        file = pq.ParquetFile(pa.BufferReader(content))
+        found_schema = file.schema_arrow
+        table = file.read(columns=None if columns is None else list(columns), use_threads=False)
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error
-    if schema is not None and not table.schema.equals(schema):
-        found, wanted = ({field.name: field.type for field in each} for each in (table.schema, schema))
+    if schema is not None and not found_schema.equals(schema):
+        found, wanted = ({field.name: field.type for field in each} for each in (found_schema, schema))
         odd = ", ".join(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
         raise DatasetError(f"shard {path} has another schema (differs in {odd}); {remedy}")
     return table, content

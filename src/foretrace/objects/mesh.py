@@ -53,6 +53,7 @@ class MeshObject(ObjectModel):
         ShapeError: if the mesh is not watertight or has no believable size.
     """
 
+    kind = "mesh"
     vertices: Float[np.ndarray, "v 3"]
     """Vertices in the object frame [m]."""
     faces: Int[np.ndarray, "f 3"]
@@ -153,7 +154,7 @@ class MeshObject(ObjectModel):
     def to_dict(self) -> dict[str, Any]:
         """Everything needed to make the object again, as plain JSON values."""
         return {
-            "kind": "mesh",
+            "kind": self.kind,
             "vertices": self.vertices.tolist(),
             "faces": self.faces.tolist(),
             "bevel": [self.bevel.width, self.bevel.height],

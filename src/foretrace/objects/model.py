@@ -1,9 +1,10 @@
 """What every object offers, and the checks that all objects share."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import shapely
@@ -12,6 +13,7 @@ from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError
 from foretrace.geometry import convex_hull
+from foretrace.registry import Registry
 
 SIZE_LIMITS = (0.01, 1.0)
 """Smallest and largest believable length of an object [m]: anything else is a wrong unit or scale."""
@@ -81,13 +83,19 @@ CollisionShape = HullShape | CylinderShape
 """What a physics engine builds objects from, in terms that every engine knows."""
 
 
+OBJECTS: Registry[type["ObjectModel"]] = Registry("object", "foretrace.objects", ShapeError)
+"""Every family of objects by its kind."""
+
+
 class ObjectModel(ABC):
     """A rigid object of uniform density at rest on the table.
 
     The object frame is the one its corners are given in; z points up and z = 0 is the table side.
-    Objects are frozen and their arrays read-only.
+    Objects are frozen and their arrays read-only. A subclass registers itself by its kind.
     """
 
+    kind: ClassVar[str]
+    """Name of the family in records."""
     corners: Float[np.ndarray, "n 2"]
     """Outline seen from above, counter-clockwise, object frame [m]. Edge k runs from corner k to k + 1."""
     height: float
@@ -121,12 +129,36 @@ class ObjectModel(ABC):
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
-        """Everything needed to make the object again, as plain JSON values."""
+        """``kind``, and everything needed to make the object again, as plain JSON values."""
+
+    @classmethod
+    @abstractmethod
+    def from_dict(cls, values: dict[str, Any]) -> "ObjectModel":
+        """The object that ``to_dict`` described."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if "kind" in cls.__dict__:
+            OBJECTS.add(cls.kind, cls)
 
     @cached_property
     def size(self) -> float:
         """Largest distance between two corners [m]."""
         return largest_distance(self.corners)
+
+
+def object_from_dict(values: Mapping[str, Any]) -> ObjectModel:
+    """The object that ``ObjectModel.to_dict`` described.
+
+    Raises:
+        ShapeError: If the kind is unknown, a value is missing or the geometry is not usable.
+    """
+    family = OBJECTS.find(values.get("kind"))
+    try:
+        return family.from_dict(dict(values))
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"is not usable ({error!r}): write it with to_dict"
+        raise ShapeError(f"description of a {family.kind} {reason}") from error
 
 
 def largest_distance(points: Float[np.ndarray, "n 2"]) -> float:

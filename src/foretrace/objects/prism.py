@@ -54,6 +54,7 @@ class Prism(ObjectModel):
             self-intersection, a size or height beyond belief, or a bevel that leaves no bottom face.
     """
 
+    kind = "prism"
     corners: Float[np.ndarray, "n 2"]
     """Corners of the simple polygon, convex or not, in the object frame [m]."""
     height: float = DEFAULT_HEIGHT
@@ -135,7 +136,7 @@ class Prism(ObjectModel):
     def to_dict(self) -> dict[str, Any]:
         """Everything needed to make the prism again, as plain JSON values."""
         return {
-            "kind": "prism",
+            "kind": self.kind,
             "corners": self.corners.tolist(),
             "height": self.height,
             "bevel": [self.bevel.width, self.bevel.height],

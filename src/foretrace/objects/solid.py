@@ -41,6 +41,7 @@ class Box(Prism):
         ShapeError: if a side is not a believable length, or the bevel leaves no bottom face.
     """
 
+    kind = "box"
     width: float
     """Side along x [m]."""
     depth: float
@@ -57,7 +58,7 @@ class Box(Prism):
     def to_dict(self) -> dict[str, Any]:
         """Everything needed to make the box again, as plain JSON values."""
         return {
-            "kind": "box",
+            "kind": self.kind,
             "width": self.width,
             "depth": self.depth,
             "height": self.height,
@@ -84,6 +85,7 @@ class Cylinder(ObjectModel):
         ShapeError: if radius or length is not believable.
     """
 
+    kind = "cylinder"
     radius: float
     """Radius [m]."""
     length: float
@@ -131,7 +133,7 @@ class Cylinder(ObjectModel):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything needed to make the cylinder again, as plain JSON values."""
-        return {"kind": "cylinder", "radius": self.radius, "length": self.length}
+        return {"kind": self.kind, "radius": self.radius, "length": self.length}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Cylinder":

@@ -324,19 +324,18 @@ def _onset(
     return float(times[k - 1] + np.clip(share, 0, 1) * (times[k] - times[k - 1]))
 
 
-def _record(
-    times: Float[np.ndarray, " frame"],
-    T_table_object: Float[np.ndarray, "frame 4 4"],
-    observation: Observation,
-    start: float,
-    config: ImportConfig,
-    followed: Track,
-) -> Interaction:
-    """The interaction on the data's time grid, in the action frame."""
+def _sample_times(
+    times: Float[np.ndarray, " frame"], start: float, config: ImportConfig, followed: Track
+) -> Float[np.ndarray, " time"]:
+    """Times of the interaction's samples since the blade's start [s], as far as the recording has them.
+
+    Raises:
+        PerceptionError: The recording begins too late, ends too early, or has too long a gap.
+    """
     count = round(config.path.duration / config.sample_period) + 1
     grid = config.sample_period * np.arange(count)
     grid = grid[: int(np.searchsorted(grid, times[-1] - start + 1e-6, side="right"))]
-    if len(grid) < 2 or start + grid[-1] < start + config.path.lift_start:
+    if len(grid) < 2 or grid[-1] < config.path.lift_start:
         raise PerceptionError(
             f"the recording ends {times[-1] - start:.2f} s after the blade starts, before the lift: record to the end"
         )
@@ -348,9 +347,21 @@ def _record(
         if end >= start and begin <= start + grid[-1]:
             raise PerceptionError(
                 f"the object's markers are not seen from {begin:.2f} to {end:.2f} s, longer than the "
-                f"{config.track.largest_gap} s that are bridged: covered, or seen too flatly; record "
-                "again from elsewhere"
+                f"{config.track.largest_gap} s that are bridged: covered, or seen too flatly; record from another side"
             )
+    return grid
+
+
+def _record(
+    times: Float[np.ndarray, " frame"],
+    T_table_object: Float[np.ndarray, "frame 4 4"],
+    observation: Observation,
+    start: float,
+    config: ImportConfig,
+    followed: Track,
+) -> Interaction:
+    """The interaction on the data's time grid, in the action frame."""
+    grid = _sample_times(times, start, config, followed)
     T_action_table = invert_transform(observation.T_table_action)
     there = np.isfinite(T_table_object[:, 0, 0])
     known = T_action_table @ T_table_object[there]

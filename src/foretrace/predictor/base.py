@@ -93,7 +93,7 @@ class EffectPredictor(Imaginer, nn.Module):
         self.config = config
         """Its settings."""
         self.features = config.make_features()
-        """What it is told about the object."""
+        """Features of the object that it is given."""
         self.outcomes = tuple(outcomes)
         """Outcomes that it distinguishes."""
         self.state: StateKind = state
@@ -303,10 +303,23 @@ class EffectPredictor(Imaginer, nn.Module):
         return (states32 - self.state_mean) / self.state_scale
 
     @final
-    def compute_features(self, inputs: Shaped[Tensor, "batch ..."]) -> Float[Tensor, "batch features"]:
-        """Features of prepared inputs, on the predictor's device, as they are outside training."""
+    def compute_features(
+        self, inputs: Shaped[Tensor, "batch ..."], in_place: bool = False
+    ) -> Float[Tensor, "batch features"]:
+        """Features of prepared inputs, on the predictor's device, as they are outside training.
+
+        Args:
+            inputs: Inputs of the features.
+            in_place: Whether features that are as large as their inputs may take their place.
+        """
         with _evaluating(self):
-            return torch.cat([self.features(part.to(self.device)) for part in inputs.split(ROWS_AT_ONCE)])
+            parts = inputs.split(ROWS_AT_ONCE)
+            first = self.features(parts[0].to(self.device))
+            if in_place and (first.shape, first.dtype) == (parts[0].shape, inputs.dtype):
+                for part in parts:
+                    part.copy_(self.features(part.to(self.device)))
+                return inputs.to(self.device)
+            return torch.cat([first, *(self.features(part.to(self.device)) for part in parts[1:])])
 
     @final
     def imagine_states(

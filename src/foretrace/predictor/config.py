@@ -111,7 +111,7 @@ class PredictorConfig:
     """Recommended settings of its training."""
 
     features: str = "none"
-    """Features of the object, by their label: what the predictor is told about it."""
+    """Features of the object that the predictor is given, by their label."""
     feature_options: dict[str, Option] = field(default_factory=dict)
     """Settings of the feature extractor, by name."""
     context: tuple[str, ...] = ()

@@ -22,7 +22,7 @@ class LstmConfig(PredictorConfig):
     """Settings of the paper's predictor."""
 
     features: str = "im-cnn"
-    """Features of the object, by their label: what the predictor is told about it."""
+    """Features of the object that the predictor is given, by their label."""
     state: StateKind = "position"
     """What is predicted: position of the centre of mass, or the whole pose."""
     steps_ahead: int = 1

@@ -1,6 +1,5 @@
 """Model card of a predictor: a page in Markdown, made from its run and its data."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -180,8 +179,8 @@ def _ranges(predictor: EffectPredictor) -> str:
 
 def _families(dataset: Dataset) -> dict[int, str]:
     """Kind of object of each interaction, by id; the corners of flat ones are counted, unless they form a curve."""
-    kinds = (json.loads(text)["kind"] for text in dataset.table["object"].to_pylist())
-    corners, ids = (dataset.table[name].to_pylist() for name in ("num_corners", "id"))
+    kinds = (obj["kind"] for obj in dataset.objects())
+    corners, ids = (dataset.index[name].to_pylist() for name in ("num_corners", "id"))
     return {
         id: kind
         if kind != "prism"

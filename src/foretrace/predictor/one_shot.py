@@ -1,5 +1,6 @@
 """A direct trajectory predictor: whole motions at once, alternatives with probabilities, and error scales."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -46,6 +47,10 @@ SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step compares: it makes the step cheaper."""
 
 
+PIECE = 20_000
+"""Interactions of a large data set that are looked at together."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class OneShotConfig(PredictorConfig):
     """Settings of the direct (non-autoregressive) trajectory predictor."""
@@ -53,7 +58,7 @@ class OneShotConfig(PredictorConfig):
     training = TrainConfig(epochs=150, learning_rate=4e-3)
 
     features: str = "outline"
-    """Features of the object: it reads outline alone."""
+    """Features of the object that the predictor is given: outline alone fits."""
     hidden: int = 128
     """Units of each hidden layer."""
     layers: int = 3
@@ -164,19 +169,21 @@ class OneShotPredictor(EffectPredictor):
         A shorter trajectory counts as if it stayed where it ends. Components are found separately for the coordinates
         that stay the same in a mirror and those that change their sign: each is its own mirror image, up to its sign.
         """
-        edges = self._find_edges(features, self._com(effects.states))
-        values = edges.values.flatten(0, 2)
+        seen = [self._seen(*piece) for piece in _pieces(features, effects)]
+        values, moved = (torch.cat(parts) for parts in zip(*seen, strict=True))
         self.value_mean.copy_(values.mean(dim=0))
         scale = values.std(dim=0, correction=0)
         # A value that is nearly constant tells nothing apart, and must not blow up where it is not: it is shifted.
         self.value_scale.copy_(torch.where(scale < SAME, 1.0, scale))
-        moved = along_edges(edges.axes[:, 0, 0], self._motion(self._held(effects)))  # (batch, time, 6)
         odd = torch.isin(torch.arange(COORDINATES), torch.tensor(ODD)).to(moved)
         self.mean_motion.copy_(moved.mean(dim=0) * (1 - odd))
         found = []
         for parity, part in ((1.0, 1 - odd), (-1.0, odd)):
-            deviation = ((moved - self.mean_motion) * part).flatten(1)
-            _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
+            if len(moved) <= PIECE:
+                deviation = ((moved - self.mean_motion) * part).flatten(1)
+                _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
+            else:
+                sizes, directions = self._principal_axes(moved, part)
             found += [
                 (float(s), parity, d) for s, d in zip(sizes / len(moved) ** 0.5, directions, strict=True)
             ]
@@ -184,6 +191,25 @@ class OneShotPredictor(EffectPredictor):
         for k, (size, parity, direction) in enumerate(found[: len(self.motions)]):
             self.motions[k] = size * direction.view_as(self.mean_motion)
             self.parity[k] = parity
+
+    def _seen(
+        self, features: Float[Tensor, "batch inputs"], effects: Effects
+    ) -> tuple[Float[Tensor, "rows values"], Float[Tensor, "batch time 6"]]:
+        """Values relative to all candidate edges, and motions along the first one."""
+        edges = self._find_edges(features, self._com(effects.states))
+        moved = along_edges(edges.axes[:, 0, 0], self._motion(self._held(effects)))
+        return edges.values.flatten(0, 2), moved
+
+    def _principal_axes(
+        self, moved: Float[Tensor, "batch time 6"], part: Float[Tensor, "6"]
+    ) -> tuple[Float[Tensor, " axes"], Float[Tensor, "axes numbers"]]:
+        """Singular values and right singular vectors of deviations, from sums over pieces: without a copy of them."""
+        gram = torch.zeros(moved[0].numel(), moved[0].numel(), dtype=torch.float64, device=self.device)
+        for piece in moved.split(PIECE):
+            deviation = ((piece - self.mean_motion) * part).flatten(1).double()
+            gram += deviation.mT @ deviation
+        squares, axes = torch.linalg.eigh(gram)  # in rising order
+        return squares.clamp(min=0).sqrt().flip(0).float(), axes.mT.flip(0).float()
 
     def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
         """Negative log-likelihood of the observed motions, in units of the normalised position.
@@ -234,8 +260,8 @@ class OneShotPredictor(EffectPredictor):
         widths of regions (split-conformal prediction).
         """
         residuals, other_residuals = (
-            self._residuals(features, effects),
-            self._residuals(other_features, other_effects),
+            torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
+            for part in ((features, effects), (other_features, other_effects))
         )
         for outcome in range(len(self.outcomes)):
             mine, others = (
@@ -389,3 +415,11 @@ class OneShotPredictor(EffectPredictor):
         time = torch.arange(effects.states.shape[1], device=self.device)
         held = time.expand(len(effects), -1).minimum(effects.lengths[:, None] - 1)
         return effects.states.gather(1, held[..., None].expand_as(effects.states))
+
+
+def _pieces(
+    features: Float[Tensor, "batch inputs"], effects: Effects
+) -> Iterator[tuple[Float[Tensor, "_ inputs"], Effects]]:
+    """The same rows of features and effects, no more than `PIECE` at a time."""
+    for rows in torch.arange(len(effects), device=features.device).split(PIECE):
+        yield features[rows], effects[rows]

@@ -5,7 +5,7 @@ import io
 import json
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -142,11 +142,11 @@ class RunFolder:
         }
         write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": versions})
 
-    def write_split(self, batch: InteractionBatch, split: Split) -> None:
+    def write_split(self, source: InteractionBatch | Dataset, split: Split) -> None:
         """Note the ids of the interactions in each part, and what they were."""
-        parts = asdict(split).items()
-        content = {part: batch.ids[rows].tolist() for part, rows in parts}
-        prints = {part: fingerprint(batch[np.sort(rows)]) for part, rows in parts}
+        parts, ids = asdict(split).items(), source.ids
+        content = {part: ids[rows].tolist() for part, rows in parts}
+        prints = {part: fingerprint(source[np.sort(rows)]) for part, rows in parts}
         write_json(self.path / SPLIT, {**content, "fingerprints": prints})
 
     def save(self, progress: Progress, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
@@ -208,12 +208,35 @@ class RunFolder:
         (self.path / RESUME).unlink(missing_ok=True)
 
 
-def fingerprint(batch: InteractionBatch, context: Sequence[str] = ()) -> str:
-    """A short hash of everything in a batch that a training can read, and of the context that it is conditioned on."""
-    names = ("ids", "mask", "height", "times", "com", "pose", "length", "slip_index", "support_points")
-    arrays = [np.ascontiguousarray(getattr(batch, name)).tobytes() for name in names]
-    told = [np.ascontiguousarray(column_of(batch, name)).tobytes() for name in context]
-    return short_hash(*arrays, "\n".join(batch.outcome.tolist()).encode(), *told)
+Source = InteractionBatch | Dataset
+
+
+def fingerprint(source: InteractionBatch | Dataset, context: Sequence[str] = ()) -> str:
+    """A short hash of everything in interactions that a training can read, and of the context it is conditioned on."""
+    return short_hash(_contents(source, context))
+
+
+def _contents(source: InteractionBatch | Dataset, context: Sequence[str]) -> Iterator[bytes]:
+    """The same bytes of a batch and of a data set, which is gone through for each of the large arrays."""
+    small: dict[str, list[np.ndarray]] = {}
+    yield np.ascontiguousarray(source.ids).tobytes()
+    for name in ("mask", "height", "times", "com", "pose"):
+        if name == "times":
+            yield np.ascontiguousarray(source.times).tobytes()
+            continue
+        for batch in source.batches():
+            yield np.ascontiguousarray(getattr(batch, name)).tobytes()
+            if name == "mask":
+                for column in ("length", "slip_index", "support_points", "outcome"):
+                    small.setdefault(column, []).append(getattr(batch, column))
+                for column in context:
+                    small.setdefault(f"context {column}", []).append(column_of(batch, column))
+    joined = {name: np.concatenate(parts) for name, parts in small.items()}
+    for name in ("length", "slip_index", "support_points"):
+        yield np.ascontiguousarray(joined[name]).tobytes()
+    yield "\n".join(joined["outcome"].tolist()).encode()
+    for name in context:
+        yield np.ascontiguousarray(joined[f"context {name}"]).tobytes()
 
 
 def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
@@ -228,8 +251,7 @@ def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
         return {}
     names = [name for name in json.loads(file.read_text(encoding="utf-8")) if name != "fingerprints"]
     try:
-        batch = data.batch()
-        return {name: part_of(run, batch, name).ids.tolist() for name in names}
+        return {name: _rows_of(run, data, name).ids.tolist() for name in names}
     except (DatasetError, TrainingError):
         return {}
 
@@ -245,6 +267,12 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
     Raises:
         TrainingError: The folder has no such part, or the data lacks interactions that were in it.
     """
+    found = _rows_of(run, data, part)
+    return found if isinstance(found, InteractionBatch) else found.batch()
+
+
+def _rows_of(run: str | Path, data: Source, part: str) -> Source:
+    """The interactions that were one part of a training's split, and are still the same."""
     file = Path(run) / SPLIT
     if not file.is_file():
         raise TrainingError(f"{file} is missing: {run} is not the folder of a training")
@@ -252,19 +280,20 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
     prints = parts.pop("fingerprints")
     if part not in parts:
         raise TrainingError(f"{file} has no part {part!r}; it has: {', '.join(parts)}")
-    batch = data if isinstance(data, InteractionBatch) else data.batch()
-    rows = np.flatnonzero(np.isin(batch.ids, parts[part]))
+    rows = np.flatnonzero(np.isin(data.ids, parts[part]))
+    _ = data.times  # those of the whole from here on, even if the part's longest trajectory is shorter
     if len(rows) != len(parts[part]):
         raise TrainingError(
             f"the data has {len(rows)} of the {len(parts[part])} interactions in the {part} part of {run}: "
             "give the data set that it was trained on"
         )
-    if fingerprint(batch[rows]) != prints[part]:
+    found: Source = data[rows]
+    if fingerprint(found) != prints[part]:
         raise TrainingError(
             f"the interactions in the {part} part of {run} were others than those in the data: "
             "give the data set that it was trained on"
         )
-    return batch[rows]
+    return found
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

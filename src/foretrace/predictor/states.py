@@ -24,6 +24,9 @@ with the rotation as axis times angle, which grows beyond half a turn where an o
 STATE_GROUPS: dict[StateKind, tuple[int, ...]] = {"position": (3,), "pose": (3, 6), "turn": (3, 3)}
 """Sizes of the parts of a state that share one unit, and therefore one scale."""
 
+PIECE = 2048
+"""Trajectories of a large part that are looked at together."""
+
 
 @dataclass(frozen=True)
 class Effects:
@@ -49,7 +52,7 @@ def state_size(kind: StateKind) -> int:
 
 
 def valid_lengths(batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
-    """Samples of each trajectory that are learned and judged: up to where the object slipped."""
+    """Samples of each trajectory that are learned and evaluated: up to where the object slipped."""
     return np.minimum(batch.length, batch.slip_index)
 
 
@@ -114,9 +117,16 @@ def state_statistics(
     weighs every direction alike, as the reported distance does, and a coordinate that hardly moves is not
     blown up.
     """
-    rows = states[valid]
-    mean = rows.mean(axis=0)
-    deviation = rows - mean
+    if states.dtype == np.float64:
+        rows = states[valid]
+        mean = rows.mean(axis=0)
+        deviation = rows - mean
+    else:  # a large part, of which there is no room for a copy: means of pieces, and of their squares
+        pieces = [slice(k, k + PIECE) for k in range(0, len(states), PIECE)]
+        count = valid.sum()
+        mean = sum(states[k][valid[k]].sum(axis=0, dtype=float) for k in pieces) / count
+        squares = sum(((states[k][valid[k]] - mean) ** 2).sum(axis=0) for k in pieces) / count
+        deviation = np.sqrt(squares)[None]
     scale, first = [], 0
     for size in STATE_GROUPS[kind]:
         group = deviation[:, first : first + size]

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from foretrace.features.fitting import learning_rate
 from foretrace.files import short_hash
 from foretrace.imagined.context import recorded_context
 from foretrace.imagined.domain import measure, ranges_of
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.dataset import Dataset, InteractionBatch, count_outcomes
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
@@ -27,26 +28,52 @@ from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
-from foretrace.predictor.states import Effects, state_statistics, valid_lengths, valid_samples
+from foretrace.predictor.states import Effects, state_statistics, valid_lengths
 from foretrace.trajectories import final_distance, mean_distance
 
 RUNTIME = ("device", "threads", "precision")
 """Settings that say where a training runs, not what it ends with."""
 
 
-@dataclass(frozen=True)
+Source = InteractionBatch | Dataset
+PIECE = 2048
+"""Rows that are normalised or imagined together."""
+MEASURE = "measure "
+LARGE = 20_000
+"""A data set of more interactions is prepared piece by piece: it need not fit into memory."""
+
+
+@dataclass
 class _Part:
     """One part of the data, ready to learn from."""
 
-    batch: InteractionBatch
+    source: Source
+    """Its interactions."""
     inputs: Tensor
-    """Inputs of the features."""
+    """Inputs of the features; in a large part the features may take their place."""
     context: np.ndarray
     """(batch, context) values that the predictor is conditioned on [SI]."""
     states: np.ndarray
-    """(batch, time, state) in the action frame [m], zeros past the length."""
-    valid: np.ndarray
-    """(batch, time) bool: the samples within it."""
+    """(batch, time, state) in the action frame [m], zeros past the length; float32 in a large part."""
+    lengths: np.ndarray
+    """(batch,) samples of each trajectory that count."""
+    outcomes: np.ndarray
+    """(batch,) numbers of the outcomes that the predictor distinguishes."""
+    measures: dict[str, np.ndarray]
+    """(batch,) measures by which objects are compared."""
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def large(self) -> bool:
+        """Whether it was prepared piece by piece."""
+        return isinstance(self.source, Dataset)
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(batch, time) bool: the samples that count."""
+        return np.arange(self.states.shape[1]) < self.lengths[:, None]
 
 
 def fit_predictor(
@@ -80,7 +107,7 @@ def fit_predictor(
     """
     training = _loop_settings(predictor, training)
     with _made(predictor, training, batch, training.threads) as made:
-        made.learned_from = _outcomes_of(batch[split.train])
+        made.learned_from = _outcomes_of(batch.outcome[split.train])
         inputs = made.features.inputs(batch) if inputs is None else inputs
         train, validation = (
             _prepare(batch[rows], made, inputs[rows]) for rows in (split.train, split.validation)
@@ -123,24 +150,25 @@ def train_predictor(
             folder is in use, or the loss is no longer finite.
     """
     training = _loop_settings(predictor, training)
-    batch = data if isinstance(data, InteractionBatch) else data.batch()
+    source = data.batch() if isinstance(data, Dataset) and len(data) <= LARGE else data
     folder = RunFolder(out)
     threads = training.threads or (folder.threads if resume else None)
-    with _made(predictor, training, batch, threads) as made:
+    with _made(predictor, training, source, threads) as made:
         training = replace(training, outcomes=training.outcomes or made.outcomes or (str(Outcome.LEVERED),))
-        split = _choose_split(batch, training) if split is None else split
-        made.learned_from = _outcomes_of(batch[split.train])
+        outcomes, lengths = _overview(source)
+        split = _choose_split(outcomes, lengths, training) if split is None else split
+        made.learned_from = _outcomes_of(outcomes[split.train])
         described = {name: value for name, value in asdict(training).items() if name not in RUNTIME}
-        described |= {"data": fingerprint(batch, made.context), "rows": _hash_split(split)}
+        described |= {"data": fingerprint(source, made.context), "rows": _hash_split(split)}
         folder.start(made, described, resume)
         if folder.finished:
             return folder.path
-        folder.write_split(batch, split)
+        folder.write_split(source, split)
         folder.write_environment(
             {"seed": training.seed, "data": described["data"], "device": str(made.device)}
             | {"precision": made.features.precision, "threads": torch.get_num_threads()}
         )
-        train, validation = (_prepare(batch[rows], made) for rows in (split.train, split.validation))
+        train, validation = (_prepare(source[rows], made) for rows in (split.train, split.validation))
         with (
             terminal(training.num_epochs(len(split.train)), progress) as (report, show),
             tensorboard(folder.path / TENSORBOARD) as log,
@@ -187,11 +215,11 @@ class _Training:
     ):
         self.config, self.predictor, self.keeper, self.fitted = config, predictor, keeper, fitted
         self.train, self.validation = train, validation
-        self.epochs = config.num_epochs(len(train.batch))
+        self.epochs = config.num_epochs(len(train))
         mean, scale = state_statistics(train.states, train.valid, predictor.state)
-        predictor.set_normalisation(mean, scale, train.batch.times)
+        predictor.set_normalisation(mean, scale, train.source.times)
         predictor.set_context(train.context)
-        self.effects = self._effects_of(train)
+        self.effects = self._effects_of(train, in_place=train.large)
         self._fixed: tuple[Tensor, Tensor] | None = None
         self.optimizer = make_optimizer(predictor)
 
@@ -226,20 +254,18 @@ class _Training:
             other_effects = self._effects_of(self.validation)
             self.predictor.finish(features, self.effects, other_features, other_effects)
         self.keeper.finish(self.predictor)
-        batch, extractor = self.train.batch, self.predictor.features
-        measures = measure(batch, batch.com[:, 0]) | extractor.measure(self.train.inputs)
-        self.predictor.ranges = ranges_of(measures)
+        self.predictor.ranges = ranges_of(self.train.measures)
         return done
 
     def _fit_features(self, report: Callable[[str], None]) -> None:
         features, device, seed = self.predictor.features, self.predictor.device, self.config.seed
-        train, validation = (FitPart(p.inputs.to(device), p.batch) for p in (self.train, self.validation))
+        train, validation = (FitPart(p.inputs.to(device), p.source) for p in (self.train, self.validation))
         if self.fitted is None or not features.learns:
             features.fit(train, validation, seed=seed, report=report)
             return
         options = json.dumps([features.label, features.options, features.precision, seed])
         read = [(p.inputs.cpu().contiguous().numpy(), p.batch.support_points) for p in (train, validation)]
-        digest = short_hash(options.encode(), *(array.tobytes() for pair in read for array in pair))
+        digest = short_hash([options.encode(), *(array.tobytes() for pair in read for array in pair)])
         file = self.fitted / f"{features.label}-{digest}.safetensors"
         if file.is_file():
             load_tensors(features, read_tensors(file), file)
@@ -248,14 +274,18 @@ class _Training:
             self.fitted.mkdir(parents=True, exist_ok=True)
             write_tensors(file, features.state_dict())
 
-    def _effects_of(self, part: _Part) -> Effects:
-        predictor = self.predictor
-        states = (
-            predictor.normalise(part.states) * torch.from_numpy(part.valid).to(predictor.device)[..., None]
-        )
+    def _effects_of(self, part: _Part, in_place: bool = False) -> Effects:
+        """Normalised states; in place of those in metres where there is no room for both."""
+        predictor, valid = self.predictor, torch.from_numpy(part.valid)
+        if in_place:
+            states = torch.from_numpy(part.states)
+            for piece, counts in zip(states.split(PIECE), valid.split(PIECE), strict=True):
+                piece.copy_(predictor.normalise(piece.numpy()).cpu() * counts[..., None])
+            states = states.to(predictor.device)
+        else:
+            states = predictor.normalise(part.states) * valid.to(predictor.device)[..., None]
         lengths, outcomes = (
-            torch.from_numpy(numbers).to(predictor.device)
-            for numbers in (predictor.lengths(part.batch), predictor.number_outcomes(part.batch))
+            torch.from_numpy(numbers).to(predictor.device) for numbers in (part.lengths, part.outcomes)
         )
         return Effects(states, lengths, outcomes)
 
@@ -269,7 +299,10 @@ class _Training:
         return features
 
     def _features_of(self, part: _Part) -> Tensor:
-        return self.predictor.add_context(self.predictor.compute_features(part.inputs), part.context)
+        features = self.predictor.compute_features(
+            part.inputs, in_place=part.large and not self.predictor.features.trainable
+        )
+        return self.predictor.add_context(features, part.context)
 
     def _epoch(self, epoch: int, fixed: Tensor | None) -> float:
         """One pass over the training part; the mean loss. ``fixed`` are features that do not change."""
@@ -305,9 +338,12 @@ class _Training:
         """Errors of the whole roll-out from the first state alone."""
         part, predictor = self.validation, self.predictor
         features = self._features_of(part) if fixed is None else fixed
-        imagined = predictor.imagine_states(features, part.states[:, 0])
+        pieces = zip(
+            features.split(PIECE), np.split(part.states[:, 0], range(PIECE, len(part), PIECE)), strict=True
+        )
+        imagined = np.concatenate([predictor.imagine_states(*piece) for piece in pieces])
         off = (imagined - part.states)[part.valid] / predictor.state_scale.cpu().numpy()
-        truth = np.where(part.valid[..., None], part.batch.com, np.nan)
+        truth = np.where(part.valid[..., None], part.states[..., :3], np.nan)
         return {
             "validation_loss": float(np.mean(off**2)),
             "validation_full_cm": 100 * float(np.mean(mean_distance(imagined[..., :3], truth))),
@@ -327,17 +363,24 @@ def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: Train
     return config.training if training is None else training
 
 
-def _outcomes_of(batch: InteractionBatch) -> tuple[str, ...]:
-    """Outcomes that occur, in the order of `Outcome`."""
-    there = set(batch.outcome.tolist())
-    return tuple(str(outcome) for outcome in Outcome if outcome in there)
+def _outcomes_of(outcomes: np.ndarray) -> tuple[str, ...]:
+    """Outcomes that occur, in the order in which actions name them."""
+    return tuple(count_outcomes(outcomes.tolist()))
 
 
-def _choose_split(batch: InteractionBatch, training: TrainConfig) -> Split:
+def _overview(source: Source) -> tuple[np.ndarray, np.ndarray]:
+    """Outcome of each interaction, and the number of its samples up to where the object slipped."""
+    if isinstance(source, InteractionBatch):
+        return source.outcome, valid_lengths(source)
+    slips = source.index["slip_index"].fill_null(np.iinfo(np.int64).max).to_numpy()
+    return np.array(source.index["outcome"].to_pylist()), np.minimum(source.lengths, slips)
+
+
+def _choose_split(outcome: np.ndarray, lengths: np.ndarray, training: TrainConfig) -> Split:
     outcomes = training.outcomes or ()
-    usable = np.flatnonzero(np.isin(batch.outcome, outcomes) & (valid_lengths(batch) >= 2))
+    usable = np.flatnonzero(np.isin(outcome, outcomes) & (lengths >= 2))
     if len(usable) == 0:
-        present = ", ".join(np.unique(batch.outcome).tolist()) or "none"
+        present = ", ".join(np.unique(outcome).tolist()) or "none"
         raise TrainingError(
             f"no interaction has an outcome among {', '.join(outcomes)}; the data has: {present}"
         )
@@ -346,25 +389,59 @@ def _choose_split(batch: InteractionBatch, training: TrainConfig) -> Split:
 
 
 def _hash_split(split: Split) -> str:
-    return short_hash(json.dumps([rows.tolist() for rows in asdict(split).values()]).encode())
+    return short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()])
 
 
-def _prepare(batch: InteractionBatch, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
-    inputs = predictor.features.inputs(batch) if inputs is None else inputs
-    context = recorded_context(batch, predictor.context)
-    valid = valid_samples(batch, predictor.lengths(batch))
-    return _Part(batch, inputs, context, predictor.encode(batch), valid)
+def _prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
+    if isinstance(source, Dataset):
+        return _prepare_in_pieces(source, predictor)
+    inputs = predictor.features.inputs(source) if inputs is None else inputs
+    return _Part(
+        source=source,
+        inputs=inputs,
+        context=recorded_context(source, predictor.context),
+        states=predictor.encode(source),
+        lengths=predictor.lengths(source),
+        outcomes=predictor.number_outcomes(source),
+        measures=measure(source, source.com[:, 0]) | predictor.features.measure(inputs),
+    )
+
+
+def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> _Part:
+    """The same of a data set that need not fit into memory."""
+    whole: dict[str, Any] = {}
+    done = 0
+    for batch in source.batches():
+        piece = _prepare(batch, predictor)
+        columns = {
+            "inputs": piece.inputs.numpy(),
+            "context": piece.context,
+            "states": piece.states.astype(np.float32),
+            "lengths": piece.lengths,
+            "outcomes": piece.outcomes,
+            **{MEASURE + name: values for name, values in piece.measures.items()},
+        }
+        for name, values in columns.items():
+            column = whole.setdefault(name, np.empty((len(source), *values.shape[1:]), values.dtype))
+            column[done : done + len(batch)] = values
+        done += len(batch)
+    measures = {
+        name.removeprefix(MEASURE): values for name, values in whole.items() if name.startswith(MEASURE)
+    }
+    rest = {name: values for name, values in whole.items() if not name.startswith(MEASURE)}
+    rest["inputs"] = torch.from_numpy(rest["inputs"])
+    return _Part(source, measures=measures, **rest)
 
 
 @contextmanager
 def _made(
     predictor: PredictorConfig | EffectPredictor,
     training: TrainConfig,
-    batch: InteractionBatch,
+    source: Source,
     threads: int | None,
 ) -> Iterator[EffectPredictor]:
     """The untrained predictor on its device; PyTorch's threads set, its random numbers seeded for the training."""
-    device, num_samples = find_device(training.device), batch.com.shape[1]
+    device, num_samples = find_device(training.device), len(source.times)
     with seeded(training.seed, 0, device), thread_count(threads):
         made = predictor if isinstance(predictor, EffectPredictor) else predictor.make(num_samples)
         if made.num_samples != num_samples:

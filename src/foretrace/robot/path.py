@@ -1,14 +1,14 @@
 """The arm's joint path for one lever-up on a real table, in legs that each start and end at rest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from foretrace.actions import LeverUp, ToolPath, tool_transforms
+from foretrace.actions import LeverUp, tool_transforms
 from foretrace.errors import RobotError
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, pose_to_matrix
@@ -66,7 +66,6 @@ def plan_lever_up(
     kinematics: ArmKinematics,
     action: LeverUp,
     T_table_base: Float[np.ndarray, "4 4"],
-    tool_path: ToolPath,
     speed: float,
 ) -> list[ArmPath]:
     """Descent to the start of a lever-up, and the lever-up.
@@ -76,7 +75,6 @@ def plan_lever_up(
         action: The lever-up, with contact and direction in the table frame: that of an object whose corners are given
             in the table frame.
         T_table_base: The arm's base in the table frame.
-        tool_path: The blade's path.
         speed: Share of the tool path's own speed, over 0, at most 1.
 
     Raises:
@@ -86,7 +84,7 @@ def plan_lever_up(
     if not 0 < speed <= 1:
         raise RobotError(f"speed {speed}: choose more than 0 and at most 1, the tool path's own speed")
     T_base_action = invert_transform(T_table_base) @ invert_transform(action.T_action_object)
-    lever = tool_transforms(replace(action, path=tool_path).tool_motion(_knots(tool_path.duration)))
+    lever = tool_transforms(action.tool_motion(_knots(action.duration)))
     descent = np.repeat(lever[:1], len(_knots(DESCENT_TIME)), axis=0)
     remaining = 1 - _minimum_jerk(len(descent))
     descent[:, [0, 2], 3] += remaining[:, None] * np.array(ABOVE)
@@ -100,7 +98,7 @@ def plan_lever_up(
     split = len(descent)
     return [
         ArmPath("descent", _resample(np.array(solved[:split]), DESCENT_TIME / speed)),
-        ArmPath(LEVER_UP, _resample(np.array(solved[split:]), tool_path.duration / speed)),
+        ArmPath(LEVER_UP, _resample(np.array(solved[split:]), action.duration / speed)),
     ]
 
 

@@ -186,9 +186,7 @@ def record_lever_up(
     set_stage(spec, config.table, config.object_colour, np.random.default_rng([seed, 1]))
     lamp = cast_shadows(spec, np.random.default_rng([seed, 2])) if config.shadows else None
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
-    duration = config.lead_time + action.duration + config.tail_time
-    count = max(1, round(duration * config.frames_per_second))
-    times = action_start - config.lead_time + np.arange(count) / config.frames_per_second
+    times = _frame_times(action, action_start, config)
     poses = _interpolate(motion, times - action_start)[0]
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
@@ -209,6 +207,14 @@ def record_lever_up(
     for name, content in (("truth.json", truth.to_dict()), (recording_folder.MARKERS, layout)):
         write_json(folder / name, content)
     return truth
+
+
+def _frame_times(
+    action: LeverUp, action_start: float, config: RecordingConfig
+) -> Float[np.ndarray, " frame"]:
+    duration = config.lead_time + action.duration + config.tail_time
+    count = max(1, round(duration * config.frames_per_second))
+    return action_start - config.lead_time + np.arange(count) / config.frames_per_second
 
 
 def photograph_board(

@@ -1,21 +1,22 @@
 """Masks against height maps of objects that are not flat."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from foretrace.experiments.non_flat_errors import NonFlatData, example_paths, measure, spread_of_fates
-from foretrace.experiments.non_flat_report import errors_figure, markdown, paths_figure, summarise
-from PIL import Image
 
 from foretrace.cli import main
-from foretrace.errors import DatasetError
-from foretrace.experiments import non_flat_errors
-from foretrace.imagined import ImaginedBatch
-from foretrace.predictor import TrainConfig, train_predictor
+from foretrace.errors import DatasetError, ResultsError, TrainingError
+from foretrace.evaluation.run import run_experiment
+from foretrace.experiments import non_flat
+from foretrace.experiments.non_flat import NonFlat, example_paths, measure, outcome_sensitivity
+from foretrace.experiments.non_flat_data import NonFlatData
+from foretrace.experiments.non_flat_figures import paths_figure
+from foretrace.experiments.training import Recipe
+from foretrace.imagined import Futures, ImaginedBatch
+from foretrace.predictor import LstmConfig
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.states import valid_lengths
 from foretrace.simulation.collect import CollectConfig, collect
@@ -43,9 +44,10 @@ def oracle(monkeypatch) -> EffectPredictor:
 
     def imagine(batch) -> ImaginedBatch:
         judged = np.arange(len(batch.times)) < valid_lengths(batch)[:, None]
-        return ImaginedBatch(batch.times, np.where(judged[..., None], batch.com, 9.0))
+        com = np.where(judged[..., None], batch.com, 9.0)
+        return ImaginedBatch(batch.times, com, None, Futures.point(com, None, "levered"))
 
-    predictor = TrainConfig(features="none", hidden=4).make_predictor(90)
+    predictor = LstmConfig(features="none", hidden=4).make(90)
     monkeypatch.setattr(predictor, "imagine_batch", imagine)
     return predictor
 
@@ -112,74 +114,61 @@ def test_the_example_is_the_lever_up_whose_fates_lie_farthest_apart(data, oracle
     assert example_paths({}, data, rows[data.kinds == "box"]).empty
 
 
-def test_equal_lever_ups_have_one_fate(data, monkeypatch):
-    found = spread_of_fates(data, 2)
-    assert found["floor_cm"].between(1e-5, 5).all()
-    monkeypatch.setattr(non_flat_errors, "NEARLY", 0.0)
-    same = spread_of_fates(data, 2)
-    assert same["floor_cm"].max() < 1e-9
-    assert same["same"].all()
-    np.testing.assert_array_equal(same["id"], found["id"])
-    assert spread_of_fates(data, 0).empty
+def test_equal_lever_ups_end_alike(data, monkeypatch):
+    rows = data.drawn[:2].tolist()
+    found = [outcome_sensitivity(data, row) for row in rows]
+    assert all(1e-5 < each["irreducible_cm"] < 5 for each in found)
+    monkeypatch.setattr(non_flat, "NEARLY", 0.0)
+    same = [outcome_sensitivity(data, row) for row in rows]
+    assert max(each["irreducible_cm"] for each in same) < 1e-9
+    assert all(each["same"] for each in same)
+    assert [each["id"] for each in same] == [each["id"] for each in found] == data.batch.ids[rows].tolist()
 
 
 def test_the_summary_compares_seed_by_seed():
     rows = [
-        {
-            "setting": "by-outline",
-            "seed": seed,
-            "channel": channel,
-            "id": k,
-            "kind": kind,
-            "outcome": "rolled",
-        }
-        | {"full_cm": full * (1 + seed), "final_cm": 2 * full, "still_cm": 5.0}
+        {"setting": "by-outline", "seed": seed, "part": "error", "channel": channel, "id": k, "kind": kind}
+        | {"outcome": "rolled", "full_cm": full * (1 + seed), "final_cm": 2 * full, "still_cm": 5.0}
         for seed in (0, 1)
         for channel, full in (("mask", 4.0), ("height", 1.0))
         for k, kind in enumerate(("cylinder", "prism"))
     ]
-    floors = pd.DataFrame({"kind": ["cylinder"], "floor_cm": [0.2], "same": [True]})
-    summary = summarise(pd.DataFrame(rows), floors)
+    rows.append({"setting": "outcome-sensitivity", "seed": 0, "part": "sensitivity", "kind": "cylinder"})
+    rows[-1] |= {"irreducible_cm": 0.2, "same": True}
+    table, experiment = pd.DataFrame(rows), NonFlat()
+    summary = experiment.summarise(table)
     groups = summary["settings"]["by-outline"]["groups"]
     assert set(groups) == {"all", "alike", "cylinder", "prism"}
-    assert groups["all"]["mask"]["full_cm"] == {"mean": 6.0, "low": 4.0, "high": 8.0}
+    found = groups["all"]["mask"]["full_cm"]
+    assert (found["mean"], found["low"] < 4.0 < 8.0 < found["high"]) == (6.0, True)
     assert groups["all"]["ratio"] == {"mean": 0.25, "low": 0.25, "high": 0.25}
     assert (groups["all"]["interactions"], groups["alike"]["interactions"]) == (2, 1)
-    assert summary["floors"]["cylinder"]["floor_cm"] == 0.2
-    text = markdown(summary)
+    assert summary["outcome_sensitivity"]["cylinder"]["irreducible_cm"] == 0.2
+    text = experiment.report(summary, table)
     assert "| Paper, all |  |  | 7.23 | 2.77 | 0.38 |" in text
     assert "at most 0.2 over all: not met" in text
-    assert len(errors_figure(summary).axes) == 1
+    assert "| cylinder | 1 | 0.200 | 0.200 | 100 % |" in text
+    assert len(experiment.figures(table)["errors"].axes) == 1
 
 
-def test_the_command_adds_seeds_to_what_is_there(folder, tmp_path, monkeypatch, capsys):
-    def train_little(batch, config, *arguments, **options):
-        config = replace(config, hidden=4, min_steps=1)
-        assert set(config.outcomes) >= {"rolled", "slipped"}
-        return train_predictor(batch, config, *arguments, **options)
-
-    monkeypatch.setattr(non_flat_errors, "train_predictor", train_little)
-    out = tmp_path / "out"
-    command = (
-        f"evaluate non-flat --data {folder} --out {out} --splits by-outline --epochs 1 --probes 1".split()
-    )
-    assert main([*command, "--seeds", "0"]) == 0
-    first = (out / "trainings" / "by-outline-mask-0" / "metrics.csv").stat().st_mtime_ns
-    assert main([*command, "--seeds", "0", "1"]) == 0
-    assert (out / "trainings" / "by-outline-mask-0" / "metrics.csv").stat().st_mtime_ns == first
-    assert "Split by-outline, seeds 0, 1" in capsys.readouterr().out
-    errors = pd.read_csv(out / "errors.csv")
+def test_seeds_and_probes_add_to_what_is_there(folder, tmp_path):
+    quick = Recipe.of("lstm").change(hidden=4, min_steps=1, epochs=1)
+    options = {"data": folder, "splits": ("by-outline",), "recipe": quick}
+    run_experiment(NonFlat(**options, seeds=(0,), probes=1), tmp_path)
+    kept = tmp_path / "trainings" / "by-outline-mask-0" / "metrics.csv"
+    first = kept.stat().st_mtime_ns
+    found = run_experiment(NonFlat(**options, seeds=(0, 1), probes=2), tmp_path)
+    assert kept.stat().st_mtime_ns == first
+    assert "Split by-outline, seeds 0, 1" in found.report
+    errors = found.rows.loc[found.rows["part"].eq("error")]
     assert errors.groupby(["seed", "channel"]).size().to_dict() == {
         (seed, channel): 12 for seed in (0, 1) for channel in ("mask", "height")
     }
+    assert found.summary["outcome_sensitivity"]["alike"]["probes"] == 2
     for channel in ("mask", "height"):
-        config = json.loads((out / "trainings" / f"by-outline-{channel}-0" / "config.json").read_text())
-        assert config["features"]["options"]["channel"] == channel
-    assert json.loads((out / "summary.json").read_text())["settings"]["by-outline"]["seeds"] == [0, 1]
-    for name in ("errors.png", "paths.png"):
-        assert Image.open(out / name).width > 500
-    assert main([*command, "--seeds", "0", "--epochs", "2"]) == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith("foretrace: error: ")
+        config = json.loads((tmp_path / "trainings" / f"by-outline-{channel}-0" / "config.json").read_text())
+        assert f'"channel": "{channel}"' in json.dumps(config)
+        assert '"rolled"' in json.dumps(config)
 
 
 def test_what_does_not_look_alike_is_refused(tmp_path):
@@ -192,7 +181,7 @@ def test_what_does_not_look_alike_is_refused(tmp_path):
     ("options", "message"),
     [
         (["--data", "{tmp}/none"], "none"),
-        (["--seeds", "-1"], "seeds (-1,)"),
+        (["--seeds", "-1"], "seed -1 is negative"),
         (["--probes", "-1"], "--probes is -1"),
         (["--epochs", "0"], "epochs is 0: give a number from 1"),
         (["--out", "{folder}/manifest.json"], "is a file"),
@@ -209,12 +198,9 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys, options, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_defaults_train_as_everywhere(data, tmp_path, monkeypatch):
-    seen = {}
-    monkeypatch.setattr(
-        non_flat_errors, "train_predictor", lambda batch, config, out, **_: seen.update(config=config) or out
-    )
-    non_flat_errors.train(data, tmp_path, "height", "random", 3, TrainConfig())
-    usual = TrainConfig()
-    assert seen["config"].seed == 3
-    assert (seen["config"].epochs, seen["config"].learning_rate) == (usual.epochs, usual.learning_rate)
+def test_settings_that_do_not_fit_masks_and_height_maps_are_refused(folder, tmp_path):
+    recipe = Recipe.of("lstm").change(features="sp-rule")
+    with pytest.raises(ResultsError, match="'sp-rule' of lstm do not come from both masks and height maps"):
+        run_experiment(NonFlat(folder, recipe=recipe), tmp_path / "out")
+    with pytest.raises(TrainingError, match="unknown predictor 'oracle'"):
+        run_experiment(NonFlat(folder, predictor="oracle"), tmp_path / "out")
