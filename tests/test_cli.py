@@ -253,6 +253,22 @@ def test_what_does_not_exist_is_refused_in_one_line(words, message, capsys):
     assert printed.err.count("\n") == 1
 
 
+def test_options_of_a_training_reach_predictor_features_and_loop(monkeypatch):
+    asked = []
+    monkeypatch.setattr("foretrace.cli.training._train", lambda *given: asked.append(given))
+    command = ["train", "--data", "d", "--out", "o"]
+    features = ["--features", "ae-256", "--feature-epochs", "1", "--width", "8"]
+    assert cli.main([*command, *features, "--epochs", "3", "--hidden", "4", "--split", "6", "2", "2"]) == 0
+    assert cli.main([*command, "--predictor=one-shot", "--heights", "--outcomes", "levered", "slipped"]) == 0
+    (_, _, lstm, loop, split, _), (_, _, one_shot, other_loop, no_split, _) = asked
+    assert lstm.features == "ae-256"
+    assert (lstm.feature_options, lstm.hidden) == ({"epochs": 1, "width": 8}, 4)
+    assert (loop.epochs, split, no_split) == (3, (6, 2, 2), None)
+    assert one_shot.feature_options == {"heights": True}
+    assert one_shot.outcomes == ("levered", "slipped")
+    assert other_loop == type(one_shot).training
+
+
 @pytest.mark.parametrize(
     "words",
     [
