@@ -6,9 +6,11 @@ options. A block after ``<!-- needs: module -->`` runs where the module is insta
 """
 
 import importlib.util
+import json
 import re
 import shlex
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,8 +20,12 @@ import trimesh
 
 from foretrace import cli
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.motions import read_recordings
+from foretrace.objects import object_from_dict
+from foretrace.perception.markers import MarkerLayout
 from foretrace.pictures import animation
 from foretrace.predictor import LstmConfig, TrainConfig, train_predictor
+from foretrace.robot.path import read_base_pose
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
@@ -78,18 +84,15 @@ def block(page: str, start: str) -> str:
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the snippets read: data sets, a training, an outline, a silhouette, a mesh, the base of a robot."""
+    """What the snippets read: data sets, a training, an outline, a silhouette, a mesh."""
     folder = tmp_path_factory.mktemp("docs")
-    config = CollectConfig(objects=8, contacts_per_edge=1, simulation=SimulationConfig(embodiment="tool"))
+    config = CollectConfig(objects=4, contacts_per_edge=1, simulation=SimulationConfig(embodiment="tool"))
     collect(config, folder / "data/paper", workers=1)
     shutil.copytree(folder / "data/paper", folder / "data/small")
     data = Dataset.open(folder / "data/paper").where(outcome="levered")
     training = TrainConfig(epochs=1, min_steps=1, split=None, threads=1)
     train_predictor(data, LstmConfig(features="none", hidden=8), folder / "runs/im-cnn", training)
     (folder / "pentagon.txt").write_text(block("getting-started.md", "# pentagon.txt"), encoding="utf-8")
-    (folder / "base.json").write_text(
-        block("robot.md", '{\n  "format": "foretrace-base-pose"'), encoding="utf-8"
-    )
     shutil.copy(ROOT / "src/foretrace/assets/racket.png", folder / "mask.png")
     trimesh.creation.box((140, 90, 20)).apply_translation((0, 0, 10)).export(folder / "part.stl")
     return folder
@@ -129,3 +132,19 @@ def test_snippets_that_are_not_run_can_be_read(page: Path) -> None:
             for program, *arguments in snippet.commands():
                 if program == "foretrace":
                     cli.read(arguments)
+
+
+@pytest.mark.parametrize(
+    ("page", "start", "read"),
+    [
+        ("robot.md", '{\n  "format": "foretrace-base-pose"', read_base_pose),
+        ("perception.md", '{\n  "format": "foretrace-markers"', MarkerLayout.load),
+        ("replay.md", '{\n  "format": "foretrace-motion"', read_recordings),
+        ("data-set.md", '{"kind": "prism"', lambda file: object_from_dict(json.loads(file.read_text()))),
+    ],
+)
+def test_files_shown_can_be_read(
+    page: str, start: str, read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    (tmp_path / "shown.json").write_text(block(page, start), encoding="utf-8")
+    assert read(tmp_path / "shown.json") is not None
