@@ -106,7 +106,7 @@ def test_a_warning_is_one_line(folder, capsys):
     del manifest["shards"][storage.shard_name(1)]
     storage.write_manifest(folder, manifest)
     capsys.readouterr()
-    assert cli.main(["show", str(folder), "--out", str(folder / "sheet.png")]) == 0
+    assert cli.main(["show", str(folder), "--id", "3", "--out", str(folder / "one.svg")]) == 0
     printed = capsys.readouterr().err
     assert printed.startswith(f"foretrace: warning: {folder} is not finished: 1 of 2 shards are missing")
     assert printed.count("\n") == 1
@@ -130,6 +130,7 @@ def test_show_refuses_what_it_cannot_draw(folder, capsys):
     assert "no interaction 104" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_evaluate_goes_on_and_prints_what_it_found(folder, tmp_path, capsys):
     out = tmp_path / "results"
     command = f"evaluate paper --data {folder} --out {out} --proportional --workers 1".split()
@@ -252,6 +253,22 @@ def test_what_does_not_exist_is_refused_in_one_line(words, message, capsys):
     assert printed.err.count("\n") == 1
 
 
+def test_options_of_a_training_reach_predictor_features_and_loop(monkeypatch):
+    asked = []
+    monkeypatch.setattr("foretrace.cli.training._train", lambda *given: asked.append(given))
+    command = ["train", "--data", "d", "--out", "o"]
+    features = ["--features", "ae-256", "--feature-epochs", "1", "--width", "8"]
+    assert cli.main([*command, *features, "--epochs", "3", "--hidden", "4", "--split", "6", "2", "2"]) == 0
+    assert cli.main([*command, "--predictor=one-shot", "--heights", "--outcomes", "levered", "slipped"]) == 0
+    (_, _, lstm, loop, split, _), (_, _, one_shot, other_loop, no_split, _) = asked
+    assert lstm.features == "ae-256"
+    assert (lstm.feature_options, lstm.hidden) == ({"epochs": 1, "width": 8}, 4)
+    assert (loop.epochs, split, no_split) == (3, (6, 2, 2), None)
+    assert one_shot.feature_options == {"heights": True}
+    assert one_shot.outcomes == ("levered", "slipped")
+    assert other_loop == type(one_shot).training
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -343,6 +360,7 @@ def group_lives(group: int) -> bool:
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_keeps_what_is_done_and_says_how_to_go_on(tmp_path, sent):
     fast = ["--embodiment", "tool", "--insert-time", "0.1", "--lift-time", "0.2", "--hold-time", "0"]

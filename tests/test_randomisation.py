@@ -201,7 +201,7 @@ def test_what_was_drawn_is_recorded(varied):
 
 def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
     file = tmp_path / "figures.json"
-    assert main(["describe", str(varied), "--out", str(file)]) == 0
+    assert main(["data", str(varied), "--out", str(file)]) == 0
     assert "tool friction" in capsys.readouterr().out
     figures = json.loads(file.read_text())
     expected = {*storage.PHYSICS_COLUMNS[:3], "height", "bevel_width", "bevel_height", *LARGEST}
