@@ -25,8 +25,8 @@ from foretrace.objects import ObjectModel, object_from_dict
 
 CACHE_BYTES = 256 * 2**20
 """A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
-ROWS_AT_ONCE = 500
-"""Interactions that are read together where a data set is gone through."""
+ROWS_AT_ONCE = 100
+"""Interactions that are read together where a data set is gone through: those of a shard."""
 MOST_OBJECTS = 2000
 """Objects that are kept built."""
 INDEX_COLUMNS = [
@@ -176,12 +176,12 @@ class Dataset:
                 "the same `foretrace simulate` command goes on where it stopped",
                 stacklevel=2,
             )
-        tables = [shards.table(number, INDEX_COLUMNS) for number in range(len(shards))]
+        tables = [_encoded(shards.table(number, INDEX_COLUMNS)) for number in range(len(shards))]
         places = np.array(
             [(number, row) for number, table in enumerate(tables) for row in range(table.num_rows)],
             dtype=np.int64,
         )
-        empty = storage.SCHEMA.empty_table().select(INDEX_COLUMNS)
+        empty = _encoded(storage.SCHEMA.empty_table().select(INDEX_COLUMNS))
         dataset = cls(shards, pa.concat_tables([empty, *tables]), places.reshape(-1, 2), manifest)
         return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
 
@@ -262,6 +262,7 @@ class Dataset:
         """
         for start in range(0, len(self), size):
             yield self._batch(self._rows(slice(start, start + size)), self.times)
+            pa.default_memory_pool().release_unused()
 
     @property
     def ids(self) -> Int[np.ndarray, " batch"]:
@@ -369,6 +370,14 @@ class Dataset:
                 self._objects.clear()
             self._objects[description] = object_from_dict(json.loads(description))
         return self._objects[description]
+
+
+def _encoded(table: pa.Table) -> pa.Table:
+    """A table whose long texts, of which few differ, are stored once each."""
+    for name in ("path", "tool", "versions"):
+        number = table.column_names.index(name)
+        table = table.set_column(number, name, table[name].dictionary_encode())
+    return table.unify_dictionaries()
 
 
 class _Shards:

@@ -47,8 +47,10 @@ SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step compares: it makes the step cheaper."""
 
 
-PIECE = 20_000
-"""Interactions of a large data set that are looked at together."""
+LARGE = 20_000
+"""A part of more interactions is gone through in pieces, which bounds the memory that it takes."""
+PIECE = 250
+"""Interactions in such a piece; and futures of so many validate regions together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,8 +171,7 @@ class OneShotPredictor(EffectPredictor):
         A shorter trajectory counts as if it stayed where it ends. Components are found separately for the coordinates
         that stay the same in a mirror and those that change their sign: each is its own mirror image, up to its sign.
         """
-        seen = [self._seen(*piece) for piece in _pieces(features, effects)]
-        values, moved = (torch.cat(parts) for parts in zip(*seen, strict=True))
+        values, moved = self._seen_in_pieces(features, effects)
         self.value_mean.copy_(values.mean(dim=0))
         scale = values.std(dim=0, correction=0)
         # A value that is nearly constant tells nothing apart, and must not blow up where it is not: it is shifted.
@@ -179,7 +180,7 @@ class OneShotPredictor(EffectPredictor):
         self.mean_motion.copy_(moved.mean(dim=0) * (1 - odd))
         found = []
         for parity, part in ((1.0, 1 - odd), (-1.0, odd)):
-            if len(moved) <= PIECE:
+            if len(moved) <= LARGE:
                 deviation = ((moved - self.mean_motion) * part).flatten(1)
                 _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
             else:
@@ -199,6 +200,20 @@ class OneShotPredictor(EffectPredictor):
         edges = self._find_edges(features, self._com(effects.states))
         moved = along_edges(edges.axes[:, 0, 0], self._motion(self._held(effects)))
         return edges.values.flatten(0, 2), moved
+
+    def _seen_in_pieces(
+        self, features: Float[Tensor, "batch inputs"], effects: Effects
+    ) -> tuple[Float[Tensor, "rows values"], Float[Tensor, "batch time 6"]]:
+        """The same of a part of any size, with no second copy of it."""
+        whole: list[Tensor] = []
+        done = [0, 0]
+        for piece in _pieces(features, effects):
+            for k, some in enumerate(self._seen(*piece)):
+                if len(whole) == k:
+                    whole.append(some.new_empty(len(some) * len(effects) // len(piece[1]), *some.shape[1:]))
+                whole[k][done[k] : done[k] + len(some)] = some
+                done[k] += len(some)
+        return whole[0], whole[1]
 
     def _principal_axes(
         self, moved: Float[Tensor, "batch time 6"], part: Float[Tensor, "6"]
@@ -259,8 +274,9 @@ class OneShotPredictor(EffectPredictor):
         Correlations are those of the training part. The residuals' size is that of the validation part, and so are the
         widths of regions (split-conformal prediction).
         """
+        whole = LARGE if len(effects) <= LARGE else PIECE
         residuals, other_residuals = (
-            torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
+            torch.cat([self._residuals(*piece) for piece in _pieces(*part, whole)])
             for part in ((features, effects), (other_features, other_effects))
         )
         for outcome in range(len(self.outcomes)):
@@ -277,11 +293,16 @@ class OneShotPredictor(EffectPredictor):
                 white = torch.linalg.solve_triangular(root, others.mT, upper=False)
                 covariance = covariance * white.square().mean()
             self.covariance[outcome] = covariance
-        com = self._com(other_effects.states)
-        futures = self._futures(self.mixture(other_features, com))
-        truth = self._metres(other_effects.states).double().cpu().numpy()
-        scores = conformal_scores(futures, truth, other_effects.lengths.cpu().numpy())
-        self.quantiles.copy_(torch.from_numpy(quantiles_of(scores)))
+        scores = [self._scores(*piece) for piece in _pieces(other_features, other_effects, PIECE)]
+        self.quantiles.copy_(torch.from_numpy(quantiles_of(np.concatenate(scores))))
+
+    def _scores(
+        self, features: Float[Tensor, "batch inputs"], effects: Effects
+    ) -> Float[np.ndarray, " batch"]:
+        """Conformal scores of observed motions."""
+        futures = self._futures(self.mixture(features, self._com(effects.states)))
+        truth = self._metres(effects.states).double().cpu().numpy()
+        return conformal_scores(futures, truth, effects.lengths.cpu().numpy())
 
     def roll_out(
         self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
@@ -418,8 +439,9 @@ class OneShotPredictor(EffectPredictor):
 
 
 def _pieces(
-    features: Float[Tensor, "batch inputs"], effects: Effects
+    features: Float[Tensor, "batch inputs"], effects: Effects, whole: int = LARGE
 ) -> Iterator[tuple[Float[Tensor, "_ inputs"], Effects]]:
-    """The same rows of features and effects, no more than `PIECE` at a time."""
-    for rows in torch.arange(len(effects), device=features.device).split(PIECE):
+    """Rows of features and effects: all together up to a number, otherwise `PIECE` at a time."""
+    size = len(effects) if len(effects) <= whole else PIECE
+    for rows in torch.arange(len(effects), device=features.device).split(max(size, 1)):
         yield features[rows], effects[rows]
