@@ -176,7 +176,8 @@ class Dataset:
                 "the same `foretrace simulate` command goes on where it stopped",
                 stacklevel=2,
             )
-        tables = [_encoded(shards.table(number, INDEX_COLUMNS)) for number in range(len(shards))]
+        columns = None if shards.fit else INDEX_COLUMNS
+        tables = [_encoded(shards.table(k, columns).select(INDEX_COLUMNS)) for k in range(len(shards))]
         places = np.array(
             [(number, row) for number, table in enumerate(tables) for row in range(table.num_rows)],
             dtype=np.int64,
@@ -391,6 +392,11 @@ class _Shards:
     def __len__(self) -> int:
         return len(self._checksums)
 
+    @cached_property
+    def fit(self) -> bool:
+        """Whether all of them fit into memory, to judge by the first one."""
+        return len(self) == 0 or self.table(0).nbytes * len(self) <= CACHE_BYTES
+
     def table(self, number: int, columns: list[str] | None = None) -> pa.Table:
         """The rows of a shard, with all or some of its columns.
 
@@ -402,7 +408,7 @@ class _Shards:
             name, checksum = self._checksums[number]
             table = storage.read_shard(self.path, name, checksum, columns=columns)[0]
             if columns is None:
-                if table.nbytes * len(self) > CACHE_BYTES:
+                if not self.__dict__.get("fit", False):
                     self._kept.clear()
                 self._kept[number] = table
         return table if columns is None else table.select(columns)

@@ -47,10 +47,11 @@ SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step compares: it makes the step cheaper."""
 
 
-LARGE = 20_000
-"""A part of more interactions is gone through in pieces, which bounds the memory that it takes."""
-PIECE = 250
-"""Interactions in such a piece; and futures of so many validate regions together."""
+LARGE, ENOUGH = 20_000, 8_000
+"""The PCA basis, scales and covariances of a training part of more interactions than the first number come from some of
+them, about as many as the second number."""
+PIECE = 2_000
+"""Interactions of which futures are held in memory together in the end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +172,10 @@ class OneShotPredictor(EffectPredictor):
         A shorter trajectory counts as if it stayed where it ends. Components are found separately for the coordinates
         that stay the same in a mirror and those that change their sign: each is its own mirror image, up to its sign.
         """
-        values, moved = self._seen_in_pieces(features, effects)
+        features, effects = _some(features, effects)
+        edges = self._find_edges(features, self._com(effects.states))
+        values = edges.values.flatten(0, 2)
+        moved = along_edges(edges.axes[:, 0, 0], self._motion(self._held(effects)))  # (batch, time, 6)
         self.value_mean.copy_(values.mean(dim=0))
         scale = values.std(dim=0, correction=0)
         # A value that is nearly constant tells nothing apart, and must not blow up where it is not: it is shifted.
@@ -180,11 +184,8 @@ class OneShotPredictor(EffectPredictor):
         self.mean_motion.copy_(moved.mean(dim=0) * (1 - odd))
         found = []
         for parity, part in ((1.0, 1 - odd), (-1.0, odd)):
-            if len(moved) <= LARGE:
-                deviation = ((moved - self.mean_motion) * part).flatten(1)
-                _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
-            else:
-                sizes, directions = self._principal_axes(moved, part)
+            deviation = ((moved - self.mean_motion) * part).flatten(1)
+            _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
             found += [
                 (float(s), parity, d) for s, d in zip(sizes / len(moved) ** 0.5, directions, strict=True)
             ]
@@ -192,39 +193,6 @@ class OneShotPredictor(EffectPredictor):
         for k, (size, parity, direction) in enumerate(found[: len(self.motions)]):
             self.motions[k] = size * direction.view_as(self.mean_motion)
             self.parity[k] = parity
-
-    def _seen(
-        self, features: Float[Tensor, "batch inputs"], effects: Effects
-    ) -> tuple[Float[Tensor, "rows values"], Float[Tensor, "batch time 6"]]:
-        """Values relative to all candidate edges, and motions along the first one."""
-        edges = self._find_edges(features, self._com(effects.states))
-        moved = along_edges(edges.axes[:, 0, 0], self._motion(self._held(effects)))
-        return edges.values.flatten(0, 2), moved
-
-    def _seen_in_pieces(
-        self, features: Float[Tensor, "batch inputs"], effects: Effects
-    ) -> tuple[Float[Tensor, "rows values"], Float[Tensor, "batch time 6"]]:
-        """The same of a part of any size, with no second copy of it."""
-        whole: list[Tensor] = []
-        done = [0, 0]
-        for piece in _pieces(features, effects):
-            for k, some in enumerate(self._seen(*piece)):
-                if len(whole) == k:
-                    whole.append(some.new_empty(len(some) * len(effects) // len(piece[1]), *some.shape[1:]))
-                whole[k][done[k] : done[k] + len(some)] = some
-                done[k] += len(some)
-        return whole[0], whole[1]
-
-    def _principal_axes(
-        self, moved: Float[Tensor, "batch time 6"], part: Float[Tensor, "6"]
-    ) -> tuple[Float[Tensor, " axes"], Float[Tensor, "axes numbers"]]:
-        """Singular values and right singular vectors of deviations, from sums over pieces: without a copy of them."""
-        gram = torch.zeros(moved[0].numel(), moved[0].numel(), dtype=torch.float64, device=self.device)
-        for piece in moved.split(PIECE):
-            deviation = ((piece - self.mean_motion) * part).flatten(1).double()
-            gram += deviation.mT @ deviation
-        squares, axes = torch.linalg.eigh(gram)  # in rising order
-        return squares.clamp(min=0).sqrt().flip(0).float(), axes.mT.flip(0).float()
 
     def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
         """Negative log-likelihood of the observed motions, in units of the normalised position.
@@ -274,9 +242,9 @@ class OneShotPredictor(EffectPredictor):
         Correlations are those of the training part. The residuals' size is that of the validation part, and so are the
         widths of regions (split-conformal prediction).
         """
-        whole = LARGE if len(effects) <= LARGE else PIECE
+        features, effects = _some(features, effects)
         residuals, other_residuals = (
-            torch.cat([self._residuals(*piece) for piece in _pieces(*part, whole)])
+            torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
             for part in ((features, effects), (other_features, other_effects))
         )
         for outcome in range(len(self.outcomes)):
@@ -293,7 +261,7 @@ class OneShotPredictor(EffectPredictor):
                 white = torch.linalg.solve_triangular(root, others.mT, upper=False)
                 covariance = covariance * white.square().mean()
             self.covariance[outcome] = covariance
-        scores = [self._scores(*piece) for piece in _pieces(other_features, other_effects, PIECE)]
+        scores = [self._scores(*piece) for piece in _pieces(other_features, other_effects)]
         self.quantiles.copy_(torch.from_numpy(quantiles_of(np.concatenate(scores))))
 
     def _scores(
@@ -438,10 +406,17 @@ class OneShotPredictor(EffectPredictor):
         return effects.states.gather(1, held[..., None].expand_as(effects.states))
 
 
+def _some(features: Float[Tensor, "batch inputs"], effects: Effects) -> tuple[Tensor, Effects]:
+    """All rows of a training part; of a large one, evenly spaced ones."""
+    step = 1 if len(effects) <= LARGE else len(effects) // ENOUGH
+    rows = torch.arange(0, len(effects), step, device=features.device)
+    return (features, effects) if step == 1 else (features[rows], effects[rows])
+
+
 def _pieces(
-    features: Float[Tensor, "batch inputs"], effects: Effects, whole: int = LARGE
+    features: Float[Tensor, "batch inputs"], effects: Effects
 ) -> Iterator[tuple[Float[Tensor, "_ inputs"], Effects]]:
-    """Rows of features and effects: all together up to a number, otherwise `PIECE` at a time."""
-    size = len(effects) if len(effects) <= whole else PIECE
-    for rows in torch.arange(len(effects), device=features.device).split(max(size, 1)):
+    """The same rows of features and effects, `PIECE` at a time; those of a part that is not large together."""
+    size = PIECE if len(effects) > 2 * PIECE else max(1, len(effects))
+    for rows in torch.arange(len(effects), device=features.device).split(size):
         yield features[rows], effects[rows]

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from foretrace.experiments.support import CHOICES, support_point_metrics
 
 from factories import fake_batch
 from foretrace.errors import TrainingError
+from foretrace.experiments.support_points import CHOICES, support_point_metrics
 from foretrace.interactions.splits import Split
 
 QUICK = {"epochs": 8, "batch_size": 8, "snapped": False}
