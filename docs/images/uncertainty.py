@@ -1,4 +1,4 @@
-"""Draws docs/images/uncertainty.svg: a sketch of futures, prediction regions and observed samples, without measured values."""
+"""Draws docs/images/uncertainty.svg: a sketch of futures, regions and observed samples; nothing in it was measured."""
 
 from pathlib import Path
 
