@@ -19,15 +19,7 @@ from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, g
 from foretrace.experiments.transfer_objects import Subject
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.pictures.scene import ARROW_LENGTH
-from foretrace.pictures.style import (
-    CM,
-    DPI,
-    GREY,
-    INK,
-    OBJECT_EDGE,
-    STYLE,
-    TOOL_COLOR,
-)
+from foretrace.pictures.style import CM, DPI, GREY, INK, OBJECT_EDGE, STYLE, TOOL_COLOR
 from foretrace.simulation.stand_in import Perturbation, StandIn, hull_of
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
