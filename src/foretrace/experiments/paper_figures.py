@@ -5,7 +5,6 @@ A figure draws whatever rows there are, says how many seeds are behind it, and i
 
 from collections.abc import Callable, Sequence
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -36,7 +35,7 @@ from foretrace.experiments.paper_claims import (
     TASK_SPECIFIC,
 )
 from foretrace.experiments.paper_comparisons import COMPARISONS
-from foretrace.pictures.style import DPI, INK, STYLE
+from foretrace.pictures.style import INK, new_figure, styled
 
 PANELS = {
     "Shape context": SHAPE_CONTEXTS,
@@ -57,7 +56,7 @@ def last(numbers: np.ndarray) -> float:
     return float(numbers[np.isfinite(numbers[:, 0])][-1, 0])
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_9a(table: pd.DataFrame) -> Figure | None:
     """Accuracy of predicted support points against the size of the training set."""
     rows = rows_of(table, "support-points", "accuracy")
@@ -65,7 +64,7 @@ def figure_9a(table: pd.DataFrame) -> Figure | None:
         return None
     settings = sorted(set(rows["setting"]), key=float)
     x = [float(setting) for setting in settings]
-    fig = Figure(figsize=(7.2, 4.4), dpi=DPI, layout="constrained")
+    fig = new_figure(7.2, 4.4)
     ax = fig.add_subplot()
     grid(ax, ylim=(0, 103), xlim=(0, 103), xlabel="training interactions used [%]", ylabel="accuracy [%]")
     ends = {}
@@ -79,13 +78,13 @@ def figure_9a(table: pd.DataFrame) -> Figure | None:
     return fig
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_9b(table: pd.DataFrame) -> Figure | None:
     """Accuracy of predicted support points on corner counts that were not learned from."""
     rows = rows_of(table, "support-points-novel", "accuracy", PAIRS)
     if rows.empty:
         return None
-    fig = Figure(figsize=(7.2, 4.4), dpi=DPI, layout="constrained")
+    fig = new_figure(7.2, 4.4)
     ax = fig.add_subplot()
     grid(ax, ylim=(0, 103), ylabel="accuracy [%]", xlabel="corner counts held out of the training")
     names = present(rows)
@@ -114,14 +113,14 @@ def draw_groups(ax: Axes, rows: pd.DataFrame, names: Sequence[str], scale: float
     return offsets
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_10(table: pd.DataFrame, metric: str) -> Figure | None:
     """Errors of all predictors on the paper's split: the boxes of figure 10."""
     rows = rows_of(table, "features", metric, ["shuffled"])
     if rows.empty:
         return None
     ahead = rows_of(table, "half-plane", metric, ["shuffled"])
-    fig = Figure(figsize=(7.6, 4.5), dpi=DPI, layout="constrained")
+    fig = new_figure(7.6, 4.5)
     ax = fig.add_subplot()
     draw_boxes(ax, rows, present(rows), ahead)
     ax.set_ylabel(ERRORS[metric])
@@ -142,13 +141,13 @@ def figure_10b(table: pd.DataFrame) -> Figure | None:
     return figure_10(table, "final")
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_10_by_object(table: pd.DataFrame) -> Figure | None:
     """The same errors where no object is in two parts, beside the paper's split."""
     by_object = {metric: rows_of(table, "features", metric, ["by-object"]) for metric in ERRORS}
     if all(rows.empty for rows in by_object.values()):
         return None
-    fig = Figure(figsize=(13.2, 4.5), dpi=DPI, layout="constrained")
+    fig = new_figure(13.2, 4.5)
     for ax, (metric, rows) in zip(fig.subplots(1, 2), by_object.items(), strict=True):
         draw_boxes(ax, rows, present(rows), rows_of(table, "features", metric, ["shuffled"]))
         ax.set_ylabel(ERRORS[metric])
@@ -185,13 +184,13 @@ def draw_panels(
     return list(axes)
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_11(table: pd.DataFrame) -> Figure | None:
     """Error against the size of the training set."""
     rows = rows_of(table, "training-size", "full", SIZES)
     if rows.empty:
         return None
-    fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
+    fig = new_figure(13.2, 4.3)
     for ax in draw_panels(fig, rows, "training-size", SIZES, [float(size) for size in SIZES]):
         ax.set_xscale("log", base=2)
         ax.set_xticks([float(size) for size in SIZES], SIZES)
@@ -202,7 +201,7 @@ def figure_11(table: pd.DataFrame) -> Figure | None:
     return fig
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_12(table: pd.DataFrame) -> Figure | None:
     """Error against the number of states predicted at once."""
     several = rows_of(table, "steps-ahead", "full", STEPS)
@@ -211,7 +210,7 @@ def figure_12(table: pd.DataFrame) -> Figure | None:
     one = rows_of(table, "features", "full", ["shuffled"]).assign(setting="1")
     pairs = several[["features", "seed"]].drop_duplicates()
     rows = pd.concat([one.merge(pairs), several])
-    fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
+    fig = new_figure(13.2, 4.3)
     for ax in draw_panels(fig, rows, "steps-ahead", ("1", *STEPS), [1.0, 2.0, 3.0, 4.0, 5.0]):
         ax.set(xticks=range(1, 6), xlim=(0.7, 5.3), xlabel="states predicted at once, n")
     finish(fig, "Error against the number of states predicted at once",
@@ -219,7 +218,7 @@ def figure_12(table: pd.DataFrame) -> Figure | None:
     return fig
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_13(table: pd.DataFrame) -> Figure | None:
     """Error on corner counts that were not learned from."""
     rows = rows_of(table, "novel-corners", "full", PAIRS)
@@ -227,7 +226,7 @@ def figure_13(table: pd.DataFrame) -> Figure | None:
         return None
     shuffled = rows_of(table, "features", "full", ["shuffled"])
     names = present(rows)
-    fig = Figure(figsize=(13.2, 4.9), dpi=DPI, layout="constrained")
+    fig = new_figure(13.2, 4.9)
     ax = fig.add_subplot()
     for name, offset in zip(names, draw_groups(ax, rows, names), strict=True):
         mean = shuffled.loc[shuffled["features"].eq(name), "value"].mean()

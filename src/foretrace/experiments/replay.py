@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -22,7 +21,7 @@ from foretrace.experiments import SUMMARIES
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix, rotation_angle
 from foretrace.interactions.motions import Recording, read_recordings
-from foretrace.pictures.style import DPI, STYLE
+from foretrace.pictures.style import new_figure, styled
 from foretrace.simulation.free_motion import simulate_free_motion
 
 FACE_TOLERANCE = np.deg2rad(20.0)
@@ -136,22 +135,20 @@ class ReplayExperiment(Experiment):
         ]
         return f"# Recorded against simulated motions in {self.engine}\n\n{markdown_table(head, lines)}\n"
 
+    @styled
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
         """Errors of position and rotation over time."""
-        with mpl.rc_context(STYLE):
-            fig = Figure(figsize=(9.6, 4.2), dpi=DPI, layout="constrained")
-            axes = fig.subplots(1, 2)
-            for name, part in rows.groupby("recording", sort=False):
-                style = style_of(str(name))
-                drawn = {"color": style.color, "linestyle": style.line}
-                axes[0].plot(part["time"], 100 * part["position_error_m"], label=str(name), **drawn)
-                axes[1].plot(part["time"], part["rotation_error_deg"], **drawn)
-            grid(axes[0], xlabel="time [s]", ylabel="position error [cm]", ylim=(0, None))
-            grid(axes[1], xlabel="time [s]", ylabel="rotation error [°]", ylim=(0, None))
-            fig.legend(loc="outside lower center", ncols=4)
-            finish(
-                fig, "Simulated against recorded motions", f"both start from the first frame; {self.engine}"
-            )
+        fig = new_figure(9.6, 4.2)
+        axes = fig.subplots(1, 2)
+        for name, part in rows.groupby("recording", sort=False):
+            style = style_of(str(name))
+            drawn = {"color": style.color, "linestyle": style.line}
+            axes[0].plot(part["time"], 100 * part["position_error_m"], label=str(name), **drawn)
+            axes[1].plot(part["time"], part["rotation_error_deg"], **drawn)
+        grid(axes[0], xlabel="time [s]", ylabel="position error [cm]", ylim=(0, None))
+        grid(axes[1], xlabel="time [s]", ylabel="rotation error [°]", ylim=(0, None))
+        fig.legend(loc="outside lower center", ncols=4)
+        finish(fig, "Simulated against recorded motions", f"both start from the first frame; {self.engine}")
         return {"errors": fig}
 
     @cached_property

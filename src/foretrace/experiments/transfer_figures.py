@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -19,7 +18,7 @@ from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, g
 from foretrace.experiments.transfer_objects import Subject
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.pictures.scene import ARROW_LENGTH
-from foretrace.pictures.style import CM, DPI, GREY, INK, OBJECT_EDGE, STYLE, TOOL_COLOR
+from foretrace.pictures.style import CM, GREY, INK, OBJECT_EDGE, TOOL_COLOR, new_figure, styled
 from foretrace.simulation.stand_in import Perturbation, StandIn, hull_of
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
@@ -41,6 +40,7 @@ PATHS_PER_ROW = 4
 """Panels with paths side by side."""
 
 
+@styled
 def objects_figure(
     subjects: Sequence[Subject], rows: pd.DataFrame, stand_in: StandIn, paper: Mapping[str, float]
 ) -> Figure:
@@ -55,42 +55,41 @@ def objects_figure(
     names = [subject.name for subject in subjects]
     columns = min(len(names), PER_ROW)
     lines = -(-len(names) // columns)
-    with mpl.rc_context(STYLE):
-        width = max(8.6, 1.75 * columns)
-        heights = [width / columns * lines * 0.95, 3.6]
-        fig = Figure(figsize=(width, 0.7 + sum(heights)), dpi=DPI, layout="constrained")
-        layout = fig.add_gridspec(2, 1, height_ratios=heights)
-        above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
-        cells = above.subplots(lines, columns, squeeze=False).ravel()
-        for ax, subject in zip(cells, subjects, strict=False):
-            draw_view(ax, subject, rows.loc[rows["object"].eq(subject.name)], stand_in)
-        for ax in cells[len(names) :]:
-            ax.axis("off")
-        draw_errors(below.subplots(), rows, names, paper)
-        handles = [
-            Patch(color=MASK_COLOR, label="mask of the camera"),
-            Patch(color=HULL_COLOR, label="added by its convex hull"),
-            Line2D([], [], color=OBJECT_EDGE, linewidth=1, label="true outline"),
-            Line2D([], [], color=TOOL_COLOR, linewidth=2.4, marker="^", label="contact shown"),
-            Line2D([], [], color=INK, marker="o", linestyle="none", markersize=4, label="other contacts"),
-        ]
-        above.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
-        shown: list[Patch | Line2D] = [
-            Patch(facecolor=color, alpha=0.45, edgecolor=color, label=f"stand-in against {name}")
-            for name, (_, color) in BARS.items()
-        ]
-        if paper:
-            shown.append(Line2D([], [], label="paper: real against predicted", **PAPER_MARK))
-        note = "bars: mean and standard deviation; dots: single lever-ups"
-        below.legend(
-            handles=shown, loc="outside lower center", ncols=3, fontsize=8.5, title=note, title_fontsize=8.5
-        )
-        title = "Objects as the predictor observes them, and the distance of its path from the stand-in's"
-        finish(
-            fig,
-            title,
-            "A simulated stand-in for the real robot: Bullet, other friction, errors of contact and camera",
-        )
+    width = max(8.6, 1.75 * columns)
+    heights = [width / columns * lines * 0.95, 3.6]
+    fig = new_figure(width, 0.7 + sum(heights))
+    layout = fig.add_gridspec(2, 1, height_ratios=heights)
+    above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
+    cells = above.subplots(lines, columns, squeeze=False).ravel()
+    for ax, subject in zip(cells, subjects, strict=False):
+        draw_view(ax, subject, rows.loc[rows["object"].eq(subject.name)], stand_in)
+    for ax in cells[len(names) :]:
+        ax.axis("off")
+    draw_errors(below.subplots(), rows, names, paper)
+    handles = [
+        Patch(color=MASK_COLOR, label="mask of the camera"),
+        Patch(color=HULL_COLOR, label="added by its convex hull"),
+        Line2D([], [], color=OBJECT_EDGE, linewidth=1, label="true outline"),
+        Line2D([], [], color=TOOL_COLOR, linewidth=2.4, marker="^", label="contact shown"),
+        Line2D([], [], color=INK, marker="o", linestyle="none", markersize=4, label="other contacts"),
+    ]
+    above.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    shown: list[Patch | Line2D] = [
+        Patch(facecolor=color, alpha=0.45, edgecolor=color, label=f"stand-in against {name}")
+        for name, (_, color) in BARS.items()
+    ]
+    if paper:
+        shown.append(Line2D([], [], label="paper: real against predicted", **PAPER_MARK))
+    note = "bars: mean and standard deviation; dots: single lever-ups"
+    below.legend(
+        handles=shown, loc="outside lower center", ncols=3, fontsize=8.5, title=note, title_fontsize=8.5
+    )
+    title = "Objects as the predictor observes them, and the distance of its path from the stand-in's"
+    finish(
+        fig,
+        title,
+        "A simulated stand-in for the real robot: Bullet, other friction, errors of contact and camera",
+    )
     return fig
 
 
@@ -166,6 +165,7 @@ def draw_errors(ax: Axes, rows: pd.DataFrame, names: Sequence[str], paper: Mappi
             label.set_verticalalignment("top")
 
 
+@styled
 def paths_figure(
     rows: pd.DataFrame,
     observed: str = "stand-in",
@@ -180,28 +180,28 @@ def paths_figure(
     """
     columns = min(len(rows), PATHS_PER_ROW)
     lines = -(-len(rows) // columns)
-    with mpl.rc_context(STYLE):
-        width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
-        fig = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-        cells = fig.subplots(lines, columns, squeeze=False).ravel()
-        for ax, row in zip(cells, rows.to_dict("records"), strict=False):
-            paths = {name: np.array(path) / CM for name, path in json.loads(row["paths_cm"]).items()}
-            slip = row.get("slip_time", np.nan)
-            slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
-            draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
-        for ax in cells[len(rows) :]:
-            ax.axis("off")
-        handles = [
-            Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
-            for name, (color, style, width) in zip(
-                (observed, "predicted", "simulated"), PATHS.values(), strict=True
-            )
-        ]
-        fig.legend(handles=handles, loc="outside lower center", ncols=3)
-        finish(fig, "Paths of the centre of mass from the side", note)
+    width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
+    fig = new_figure(width, height)
+    cells = fig.subplots(lines, columns, squeeze=False).ravel()
+    for ax, row in zip(cells, rows.to_dict("records"), strict=False):
+        paths = {name: np.array(path) / CM for name, path in json.loads(row["paths_cm"]).items()}
+        slip = row.get("slip_time", np.nan)
+        slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
+        draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
+    for ax in cells[len(rows) :]:
+        ax.axis("off")
+    handles = [
+        Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
+        for name, (color, style, width) in zip(
+            (observed, "predicted", "simulated"), PATHS.values(), strict=True
+        )
+    ]
+    fig.legend(handles=handles, loc="outside lower center", ncols=3)
+    finish(fig, "Paths of the centre of mass from the side", note)
     return fig
 
 
+@styled
 def side_figure(
     observed: Float[np.ndarray, "time 3"], predicted: Float[np.ndarray, "later 3"], title: str
 ) -> Figure:
@@ -212,12 +212,11 @@ def side_figure(
         predicted: The same as predicted.
         title: What the recording is called.
     """
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(6.4, 6.4), dpi=DPI, layout="constrained")
-        ax = fig.subplots()
-        draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
-        ax.legend(loc="upper left")
-        finish(fig, "Paths of the centre of mass from the side", "The table is grey")
+    fig = new_figure(6.4, 6.4)
+    ax = fig.subplots()
+    draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
+    ax.legend(loc="upper left")
+    finish(fig, "Paths of the centre of mass from the side", "The table is grey")
     return fig
 
 

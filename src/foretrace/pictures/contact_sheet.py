@@ -1,6 +1,5 @@
 """Many interactions from above on one sheet."""
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,18 +11,20 @@ from foretrace.interactions.record import Interaction, Outcome
 from foretrace.pictures.scene import ARROW_LENGTH, support_handle
 from foretrace.pictures.style import (
     CM,
-    DPI,
     GREY,
     INK,
     OBJECT_COLOR,
     OBJECT_EDGE,
     OUTCOME_COLORS,
-    STYLE,
     SUPPORT_COLOR,
     TOOL_COLOR,
+    headline,
+    new_figure,
+    styled,
 )
 
 
+@styled
 def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
     """Many interactions from above at one scale: outline, action, support points and path by outcome.
 
@@ -41,18 +42,17 @@ def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
     columns = min(columns, len(shown))
     rows = -(-len(shown) // columns)
     counts = dataset.outcomes()
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(1.55 * columns + 0.3, 1.7 * rows + 1.0), dpi=DPI, layout="constrained")
-        for cell, k in enumerate(shown):
-            _draw_cell(fig.add_subplot(rows, columns, cell + 1), dataset[int(k)])
-        title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
-        fig.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        handles = [
-            Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
-            for name, count in counts.items()
-        ]
-        handles.append(support_handle())
-        fig.legend(handles=handles, loc="outside lower center", ncols=8)
+    fig = new_figure(1.55 * columns + 0.3, 1.7 * rows + 1.0)
+    for cell, k in enumerate(shown):
+        _draw_cell(fig.add_subplot(rows, columns, cell + 1), dataset[int(k)])
+    title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
+    headline(fig, title)
+    handles = [
+        Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
+        for name, count in counts.items()
+    ]
+    handles.append(support_handle())
+    fig.legend(handles=handles, loc="outside lower center", ncols=8)
     return fig
 
 

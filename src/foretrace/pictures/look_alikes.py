@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -16,13 +15,14 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.pictures.scene import ARROW_LENGTH, silhouette, tool_line
 from foretrace.pictures.style import (
     CM,
-    DPI,
     GREY,
     OBJECT_COLOR,
     OBJECT_EDGE,
     OUTCOME_COLORS,
-    STYLE,
     TOOL_COLOR,
+    headline,
+    new_figure,
+    styled,
 )
 
 MARGIN = 0.02
@@ -35,6 +35,7 @@ MASK_COLORS = ListedColormap(["white", "#4a6078"])
 HEIGHT_COLORS = "cividis"
 
 
+@styled
 def non_flat_figure(interactions: Mapping[str, Interaction]) -> Figure:
     """Lever-ups of objects that look alike from above: mask, height map and motion of each, in one row.
 
@@ -54,22 +55,21 @@ def non_flat_figure(interactions: Mapping[str, Interaction]) -> Figure:
     window, highest = _window(views), max(float(view.height.max()) for view in views)
     span = _side_span([interaction for _, interaction in shown])
     width = (span[1] - span[0]) / (span[3] - span[2])
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(12.6, 0.9 + 2.35 * len(shown)), dpi=DPI, layout="constrained")
-        axes = fig.subplots(len(shown), 3, squeeze=False, width_ratios=[1.0, 1.0, 1.15 * width])
-        images = []
-        for (mask, height, side), (name, interaction) in zip(axes, shown, strict=True):
-            view = interaction.view
-            _draw_map(mask, view, window, view.mask, 1.0, MASK_COLORS)
-            images.append(_draw_map(height, view, window, view.height * CM, highest * CM, HEIGHT_COLORS))
-            _draw_motion(side, interaction, span)
-            mask.set_title(f"{name[:1].upper()}{name[1:]}: mask")
-            mask.set_ylabel("x, along the action [cm]")
-            height.set_title("Height map")
-        for ax in axes[:-1].ravel():
-            ax.set_xlabel("")
-        fig.colorbar(images[0], ax=axes[:, 1], label="height [cm]", shrink=0.7, aspect=28)
-        fig.suptitle(_headline(views), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    fig = new_figure(12.6, 0.9 + 2.35 * len(shown))
+    axes = fig.subplots(len(shown), 3, squeeze=False, width_ratios=[1.0, 1.0, 1.15 * width])
+    images = []
+    for (mask, height, side), (name, interaction) in zip(axes, shown, strict=True):
+        view = interaction.view
+        _draw_map(mask, view, window, view.mask, 1.0, MASK_COLORS)
+        images.append(_draw_map(height, view, window, view.height * CM, highest * CM, HEIGHT_COLORS))
+        _draw_motion(side, interaction, span)
+        mask.set_title(f"{name[:1].upper()}{name[1:]}: mask")
+        mask.set_ylabel("x, along the action [cm]")
+        height.set_title("Height map")
+    for ax in axes[:-1].ravel():
+        ax.set_xlabel("")
+    fig.colorbar(images[0], ax=axes[:, 1], label="height [cm]", shrink=0.7, aspect=28)
+    headline(fig, _headline(views))
     return fig
 
 

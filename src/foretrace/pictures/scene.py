@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 import shapely
 from jaxtyping import Float
@@ -24,17 +23,18 @@ from foretrace.objects import ObjectModel
 from foretrace.pictures.bands import PredictionBand
 from foretrace.pictures.style import (
     CM,
-    DPI,
     GREY,
     INK,
     OBJECT_COLOR,
     OBJECT_EDGE,
     PREDICTION_COLORS,
     PREDICTION_LINES,
-    STYLE,
     SUPPORT_COLOR,
     TOOL_COLOR,
     TRUTH_COLOR,
+    headline,
+    new_figure,
+    styled,
 )
 
 TOOL_REACH = 0.12
@@ -172,18 +172,18 @@ def interaction_figure(
     return scene_figure(Scene.observed(interaction, predictions))
 
 
+@styled
 def scene_figure(scene: Scene) -> Figure:
     """The picture of `interaction_figure` for any scene."""
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(13.2, 4.9), dpi=DPI, layout="constrained")
-        grid = fig.add_gridspec(3, 3, width_ratios=[1.0, 1.28, 1.05])
-        draw_from_above(fig.add_subplot(grid[:, 0]), scene)
-        draw_from_the_side(fig.add_subplot(grid[:, 1]), scene)
-        first = fig.add_subplot(grid[0, 2])
-        axes = [first, *(fig.add_subplot(grid[k, 2], sharex=first) for k in (1, 2))]
-        draw_over_time(axes, scene)
-        fig.suptitle(scene.title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        fig.legend(handles=legend_of(scene), loc="outside lower center", ncols=2, fontsize=9)
+    fig = new_figure(13.2, 4.9)
+    grid = fig.add_gridspec(3, 3, width_ratios=[1.0, 1.28, 1.05])
+    draw_from_above(fig.add_subplot(grid[:, 0]), scene)
+    draw_from_the_side(fig.add_subplot(grid[:, 1]), scene)
+    first = fig.add_subplot(grid[0, 2])
+    axes = [first, *(fig.add_subplot(grid[k, 2], sharex=first) for k in (1, 2))]
+    draw_over_time(axes, scene)
+    headline(fig, scene.title)
+    fig.legend(handles=legend_of(scene), loc="outside lower center", ncols=2, fontsize=9)
     return fig
 
 
@@ -293,29 +293,29 @@ def tool_line(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2 3"]:
     return transform_points(pose_to_matrix(pose), np.array([[0.0, 0, 0], [-TOOL_REACH, 0, 0]]))
 
 
+@styled
 def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
     """Several lever-ups side by side, each from above and from the side, imagined beside observed.
 
     Args:
         scenes: What to show, by the title of its column.
     """
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(3.5 * len(scenes), 7.4), dpi=DPI, layout="constrained")
-        axes = fig.subplots(2, len(scenes), squeeze=False)
-        for column, (title, scene) in enumerate(scenes.items()):
-            draw_from_above(axes[0, column], scene)
-            draw_from_the_side(axes[1, column], scene)
-            errors = [f"{name}: {_errors(scene, path)[0]:.2f} cm" for name, path in scene.predictions.items()]
-            axes[0, column].set_title("\n".join([title, *errors]), fontsize=10)
-            axes[1, column].set_title("")
-            if column > 0:
-                axes[0, column].set_ylabel("")
-                axes[1, column].set_ylabel("")
-        handles = [
-            Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
-            for name, _, color, style, width in next(iter(scenes.values())).paths()
-        ]
-        fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=4)
+    fig = new_figure(3.5 * len(scenes), 7.4)
+    axes = fig.subplots(2, len(scenes), squeeze=False)
+    for column, (title, scene) in enumerate(scenes.items()):
+        draw_from_above(axes[0, column], scene)
+        draw_from_the_side(axes[1, column], scene)
+        errors = [f"{name}: {_errors(scene, path)[0]:.2f} cm" for name, path in scene.predictions.items()]
+        axes[0, column].set_title("\n".join([title, *errors]), fontsize=10)
+        axes[1, column].set_title("")
+        if column > 0:
+            axes[0, column].set_ylabel("")
+            axes[1, column].set_ylabel("")
+    handles = [
+        Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
+        for name, _, color, style, width in next(iter(scenes.values())).paths()
+    ]
+    fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=4)
     return fig
 
 
