@@ -39,10 +39,10 @@ from foretrace.experiments.transfer_objects import (
     read_prisms,
     read_silhouettes,
 )
-from foretrace.experiments.transfer_report import PAPER_OBJECTS, RECORDED, recorded_report, report, summarise
+from foretrace.experiments.transfer_report import PAPER_OBJECTS, RECORDED, report, summarise
 from foretrace.imagined.context import true_context
 from foretrace.interactions.dataset import Dataset
-from foretrace.interactions.record import Interaction, Physics
+from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor import EffectPredictor, load_predictor
 from foretrace.predictor.run_folder import fingerprint
@@ -155,7 +155,7 @@ class Transfer(Experiment):
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """The paper's tables 1 and 2 and figure 15b with ours beside them."""
-        return recorded_report(summary, rows) if RECORDED in set(rows["group"]) else report(summary)
+        return report(summary, rows)
 
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
         """Paths at some printed or at all recorded edges; masks and errors of the other objects."""
@@ -298,7 +298,6 @@ def compare(
     view: TopDownView,
     observed: Observation,
     simulated: Interaction,
-    told: Physics | None = None,
 ) -> tuple[dict[str, Any], Float[np.ndarray, "time 3"]]:
     """Distances of one observed path from the simulated and the imagined one.
 
@@ -310,7 +309,6 @@ def compare(
         view: The object from above, as the predictor observes it.
         observed: What the stand-in showed.
         simulated: What the simulator of the training data made of it.
-        told: What a predictor that knows physical constants is told of them; by default the stand-in's own.
 
     Returns:
         The outcomes and distances [cm] as a part of a row; and the imagined path, cut where the observed one ends [m].
@@ -328,8 +326,7 @@ def compare(
     }
     if len(observed.com) == 0:
         return row, np.empty((0, 3))
-    physics = observed.physics if told is None else told
-    context = true_context(physics, predictor.context)
+    context = true_context(observed.physics, predictor.context)
     start = predictor.imagine(view, context=context, com=observed.com[0])
     imagined = start.com_trajectory[_before(start.times, slip)]
     blind = predictor.imagine(view, context=context)
