@@ -88,8 +88,9 @@ class Reconstruction(Experiment):
             str(name): {
                 "features": part["features"].iloc[0],
                 "iou_mean": round(float(np.mean(part["iou"].to_numpy(float))), 4),
+                "iou_worst": round(float(part["iou"].min()), 4),
+                "masks": len(part),
             }
-            | {"iou_worst": round(float(np.min(part["iou"].to_numpy(float))), 4), "masks": len(part)}
             for name, part in rows.groupby("training", sort=False)
         }
 
@@ -181,11 +182,8 @@ def reconstruction_figure(masks: Masks, restored: Mapping[str, Masks]) -> Figure
                     f"IoU {scores[column]:.3f}", fontsize=7.5, fontweight="normal", loc="center", pad=2
                 )
         axes[row, 0].set_ylabel(name, color=INK, fontweight="bold")
-    handles = [
-        Patch(color=KEPT, label="object"),
-        Patch(color=LOST, label="lost"),
-        Patch(color=ADDED, label="added"),
-    ]
+    words = {"object": KEPT, "lost": LOST, "added": ADDED}
+    handles = [Patch(color=color, label=name) for name, color in words.items()]
     figure.legend(handles=handles, loc="lower center", ncols=3)
     figure.subplots_adjust(left=0.07, right=0.995, top=0.97, bottom=0.09, wspace=0.06, hspace=0.16)
     return figure
