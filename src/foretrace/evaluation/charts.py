@@ -173,6 +173,12 @@ def grid(ax: Axes, **settings: Any) -> None:
     ax.set(**settings)
 
 
+def mesh(ax: Axes) -> None:
+    """Light lines in both directions."""
+    ax.grid(color=GRID, linewidth=0.6)
+    ax.set_axisbelow(True)
+
+
 def legend(fig: Figure, names: Iterable[str], extra: Sequence[Line2D] = (), *, lines: bool = True) -> None:
     """All that is drawn, below the axes."""
     handles = [

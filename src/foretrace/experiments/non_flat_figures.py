@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.evaluation.charts import BLUE, GREEN, VERMILLION, finish, grid, mesh
+from foretrace.evaluation.tables import capitalised
 from foretrace.pictures.style import INK, new_figure, styled
 
 COLORS = {"mask": VERMILLION, "height": BLUE}
@@ -81,16 +82,14 @@ def paths_figure(paths: pd.DataFrame) -> Figure:
     for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False, sharey=True)[0], kinds, strict=True):
         mine = paths.loc[paths["kind"].eq(kind)]
         for name, (color, style, width) in PATHS.items():
-            path = mine.loc[mine["path"].eq(name)]
-            x, z = path["x_cm"].to_numpy(float), path["z_cm"].to_numpy(float)
-            ax.plot(x, z, color=color, linestyle=style, linewidth=width)
-            ax.plot(x[-1:], z[-1:], "o", color=color, markersize=5)
+            path = mine.loc[mine["path"].eq(name), ["x_cm", "z_cm"]].to_numpy(float)
+            ax.plot(*path.T, color=color, linestyle=style, linewidth=width)
+            ax.plot(*path[-1:].T, "o", color=color, markersize=5)
             if name == "observed":
-                ax.plot(x[:1], z[:1], "s", color=INK, markersize=5, zorder=5)
-        ax.set_title(f"{kind[:1].upper()}{kind[1:]}: {mine['outcome'].iloc[0]}")
+                ax.plot(*path[:1].T, "s", color=INK, markersize=5, zorder=5)
+        ax.set_title(f"{capitalised(kind)}: {mine['outcome'].iloc[0]}")
         ax.set_xlabel("x, along the action [cm]")
-        ax.grid(color=GRID, linewidth=0.6)
-        ax.set_axisbelow(True)
+        mesh(ax)
     fig.axes[0].set_ylabel("z, up [cm]")
     handles = [
         Line2D([], [], color=color, linestyle=style, linewidth=width, label=words)

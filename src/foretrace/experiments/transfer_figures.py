@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.evaluation.charts import BLUE, GREEN, VERMILLION, finish, grid, mesh
 from foretrace.experiments.transfer_objects import Subject
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
-from foretrace.pictures.scene import ARROW_LENGTH
-from foretrace.pictures.style import CM, GREY, INK, OBJECT_EDGE, TOOL_COLOR, new_figure, styled
+from foretrace.pictures.scene import draw_arrow, draw_path, draw_table
+from foretrace.pictures.style import CM, INK, OBJECT_EDGE, TOOL_COLOR, new_figure, styled
 from foretrace.simulation.stand_in import Perturbation, StandIn, hull_of
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
@@ -114,8 +114,7 @@ def draw_view(ax: Axes, subject: Subject, rows: pd.DataFrame, stand_in: StandIn)
     if len(contacts):
         others = (contacts @ T[:2, :2].T + T[:2, 3]) * CM
         ax.plot(others[:, 1], others[:, 0], "o", color=INK, markersize=4)
-    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 2.4, "shrinkA": 0, "shrinkB": 0}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+    draw_arrow(ax, 2.4)
     low, high = np.minimum(outline.min(axis=0) * CM, [-5, 0]), outline.max(axis=0) * CM
     middle, half = (low + high) / 2, max((high - low).max() / 2, 9) + 1.5
     ax.set(
@@ -190,15 +189,17 @@ def paths_figure(
         draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
     for ax in cells[len(rows) :]:
         ax.axis("off")
-    handles = [
-        Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
-        for name, (color, style, width) in zip(
-            (observed, "predicted", "simulated"), PATHS.values(), strict=True
-        )
-    ]
+    handles = _handles((observed, "predicted", "simulated"))
     fig.legend(handles=handles, loc="outside lower center", ncols=3)
     finish(fig, "Paths of the centre of mass from the side", note)
     return fig
+
+
+def _handles(names: Sequence[str]) -> list[Line2D]:
+    return [
+        Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
+        for name, (color, style, width) in zip(names, PATHS.values(), strict=False)
+    ]
 
 
 @styled
@@ -215,7 +216,7 @@ def side_figure(
     fig = new_figure(6.4, 6.4)
     ax = fig.subplots()
     draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
-    ax.legend(loc="upper left")
+    ax.legend(handles=_handles(("observed", "predicted")), loc="upper left")
     finish(fig, "Paths of the centre of mass from the side", "The table is grey")
     return fig
 
@@ -223,17 +224,12 @@ def side_figure(
 def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: str) -> None:
     """Paths [m] by what they are, in the x-z plane of the action frame; scales in cm."""
     for name, path in paths.items():
-        color, style, width = PATHS[name]
-        x, z = path[:, 0] * CM, path[:, 2] * CM
-        ax.plot(x, z, color=color, linestyle=style, linewidth=width, zorder=5, label=name)
-        ax.plot(x[-1:], z[-1:], "o", color=color, markersize=4.5, zorder=6)
+        draw_path(ax, path[:, [0, 2]] * CM, *PATHS[name])
     ax.set_title(title)
     seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
     (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
     middle = (left + right) / 2
     ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
     ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
-    ax.axhspan(-1, 0, color="#f1f2f4", zorder=-1)
-    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
-    ax.grid(color=GRID, linewidth=0.6)
-    ax.set_axisbelow(True)
+    draw_table(ax, 1)
+    mesh(ax)

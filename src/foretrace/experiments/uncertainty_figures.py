@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FormatStrFormatter
 from scipy.stats import betabinom
 
-from foretrace.evaluation.charts import BLUE, GRID, QUIET, REFERENCE, VERMILLION, finish, grid
+from foretrace.evaluation.charts import BLUE, GRID, QUIET, REFERENCE, VERMILLION, finish, grid, mesh
 from foretrace.experiments.uncertainty_metrics import ALL, BEGINNINGS
 from foretrace.imagined import LEVELS
 from foretrace.interactions.record import Outcome
@@ -58,8 +58,7 @@ def _draw_reliability(ax: Axes, rows: pd.DataFrame, color: str) -> None:
     ax.set(xlim=(0, 100), ylim=(0, 100), xlabel="level of the region [%]", aspect="equal")
     ax.set_xticks(FOUND)
     ax.set_yticks(FOUND)
-    ax.grid(color=GRID, linewidth=0.6)
-    ax.set_axisbelow(True)
+    mesh(ax)
 
 
 def _chance_band(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:

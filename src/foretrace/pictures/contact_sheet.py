@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 from foretrace.errors import DatasetError
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
-from foretrace.pictures.scene import ARROW_LENGTH, support_handle
+from foretrace.pictures.scene import draw_arrow, support_handle
 from foretrace.pictures.style import (
     CM,
     GREY,
@@ -17,7 +17,6 @@ from foretrace.pictures.style import (
     OBJECT_EDGE,
     OUTCOME_COLORS,
     SUPPORT_COLOR,
-    TOOL_COLOR,
     headline,
     new_figure,
     styled,
@@ -63,8 +62,7 @@ def _draw_cell(ax: Axes, interaction: Interaction) -> None:
     placement = interaction.action.T_action_object
     outline = (interaction.object.corners @ placement[:2, :2].T + placement[:2, 3]) * CM
     ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=0.9)
-    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 1.5, "shrinkA": 0, "shrinkB": 0}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+    draw_arrow(ax, 1.5)
     points = effect.support_points * CM
     ax.plot(points[:, 1], points[:, 0], color=SUPPORT_COLOR, linewidth=1.5, marker="o", markersize=3)
     path = effect.com_trajectory * CM
