@@ -24,12 +24,7 @@ PATHS: dict[str, tuple[str, Any, float]] = {
 
 @styled
 def errors_figure(settings: Mapping[str, Any], paper: Mapping[str, float]) -> Figure:
-    """Errors of both channels by kind of object, one panel for each split.
-
-    Args:
-        settings: As `foretrace.experiments.non_flat.NonFlat.summarise` makes them.
-        paper: The paper's errors [cm].
-    """
+    """Errors of both channels by kind of object, one panel for each split."""
     fig = new_figure(max(7.4, 5.6 * len(settings)), 4.2)
     panels = fig.subplots(1, len(settings), squeeze=False, sharey=True)[0]
     for ax, (setting, found) in zip(panels, settings.items(), strict=True):
@@ -72,11 +67,7 @@ def _draw_groups(ax: Axes, groups: Mapping[str, Any], paper: Mapping[str, float]
 
 @styled
 def paths_figure(paths: pd.DataFrame) -> Figure:
-    """Observed and imagined paths of objects that look alike, from the side (paper, figure 16, right).
-
-    Args:
-        paths: As from `foretrace.experiments.non_flat.example_paths`, of at least one object.
-    """
+    """Observed and imagined paths of objects that look alike, from the side (paper, figure 16, right)."""
     kinds = list(dict.fromkeys(paths["kind"]))
     fig = new_figure(4.2 * len(kinds), 4.0)
     for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False, sharey=True)[0], kinds, strict=True):

@@ -197,13 +197,7 @@ def plan(
     """The trials that the paper's comparisons consist of.
 
     Experiment by experiment, in each of them all that one seed asks for before the next seed: whenever it is
-    interrupted, what is there can be compared.
-
-    Args:
-        experiments: Which of COMPARISONS, in this order; by default all but those on request.
-        features: Which features; by default all.
-        settings: Which settings; by default all.
-        seeds: Seeds of splits and trainings.
+    interrupted, what is there can be compared. What is not named is compared in full, but for what is on request.
 
     Raises:
         ResultsError: One of them is unknown, or they do not go together.
@@ -231,11 +225,5 @@ def plan(
 
 
 def split_of(trial: PaperTrial, batch: InteractionBatch, proportional: bool = False) -> Split:
-    """Training, validation and test part of a trial.
-
-    Args:
-        trial: The trial.
-        batch: The levered interactions.
-        proportional: Take the paper's proportions instead of its 1400, 100 and 300 interactions.
-    """
+    """Parts of the levered interactions, in the paper's sizes or in its proportions."""
     return COMPARISONS[trial.experiment].split(batch, trial.setting, trial.seed, proportional)

@@ -161,12 +161,7 @@ def overlap(one: Masks, other: Masks) -> Float[np.ndarray, " batch"]:
 
 @styled
 def reconstruction_figure(masks: Masks, restored: Mapping[str, Masks]) -> Figure:
-    """Masks above what each code made of them.
-
-    Args:
-        masks: As seen; one column each.
-        restored: What was made of the same masks, by the code's name; one row each.
-    """
+    """Masks, a column each, above what each code, by name, made of them."""
     colors = ListedColormap([BLANK, KEPT, LOST, ADDED])
     figure = Figure(figsize=(1.25 * len(masks) + 0.6, 1.35 * (1 + len(restored)) + 0.5), dpi=DPI)
     axes = figure.subplots(1 + len(restored), len(masks), squeeze=False)

@@ -183,12 +183,7 @@ class Replay:
 def replay(recording: Recording, engine: str = "mujoco", timestep: float = TIMESTEP) -> Replay:
     """Simulates a recorded motion from its first frame and compares.
 
-    A first frame that noise has put into the table is lifted out of it.
-
-    Args:
-        recording: What was recorded.
-        engine: Physics engine.
-        timestep: Time step [s].
+    A first frame that noise has put into the table is lifted out of it. The time step is in seconds.
 
     Raises:
         SimulationError: If the engine is unknown or not installed, or the numbers blow up.

@@ -260,14 +260,7 @@ def check_sees(predictor: EffectPredictor) -> None:
 def compare_played(
     predictor: EffectPredictor, played: Played, hull: bool = False, paths: bool = False
 ) -> list[dict[str, Any]]:
-    """Distances of all that was observed at one contact, as rows.
-
-    Args:
-        predictor: The predictor.
-        played: Simulated and observed lever-ups.
-        hull: Whether the predictor has the convex hull of the object's mask.
-        paths: Whether the first row gets the paths, as text.
-    """
+    """Distances of all that was observed at one contact, as rows; the first one may get the paths, as text."""
     exact = played.simulated.view
     own = own_error(predictor, hull_of(exact) if hull else exact, played.simulated)
     rows = []
@@ -304,14 +297,8 @@ def compare(
     As in the paper, the roll-out starts where the marker is seen before the action. How much of the distance that
     start takes away is told by ``distance_predicted_from_view_cm``, where it is estimated from the view.
 
-    Args:
-        predictor: The predictor.
-        view: The object from above, as the predictor observes it.
-        observed: What the stand-in showed.
-        simulated: What the simulator of the training data made of it.
-
     Returns:
-        The outcomes and distances [cm] as a part of a row; and the imagined path, cut where the observed one ends [m].
+        Outcomes and distances [cm], a part of a row; and the imagined path [m], cut where the observed one ends.
     """
     effect, slip = simulated.effect, observed.slip_time
     slipped_at = None if effect.slip_index is None else float(effect.times[effect.slip_index])

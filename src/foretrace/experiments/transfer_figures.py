@@ -44,14 +44,7 @@ PATHS_PER_ROW = 4
 def objects_figure(
     subjects: Sequence[Subject], rows: pd.DataFrame, stand_in: StandIn, paper: Mapping[str, float]
 ) -> Figure:
-    """Masks of objects as the predictor observes them, and the errors on each (paper, figure 15).
-
-    Args:
-        subjects: The objects.
-        rows: Their lever-ups.
-        stand_in: What played them; it repeats the views.
-        paper: The paper's errors by object [cm].
-    """
+    """Masks of objects as the predictor observes them, and the errors on each (paper, figure 15)."""
     names = [subject.name for subject in subjects]
     columns = min(len(names), PER_ROW)
     lines = -(-len(names) // columns)
@@ -170,13 +163,7 @@ def paths_figure(
     observed: str = "stand-in",
     note: str = "The stand-in is Bullet with other constants and errors, not a robot; the table is grey",
 ) -> Figure:
-    """Paths of the centre of mass from the side: observed, predicted, simulated (paper, figure 14, last panel).
-
-    Args:
-        rows: Lever-ups that have paths; four are shown in a row.
-        observed: What the observed path is called.
-        note: What stands under the title.
-    """
+    """Paths of the centre of mass from the side: observed, predicted, simulated (paper, figure 14, last panel)."""
     columns = min(len(rows), PATHS_PER_ROW)
     lines = -(-len(rows) // columns)
     width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
@@ -206,13 +193,7 @@ def _handles(names: Sequence[str]) -> list[Line2D]:
 def side_figure(
     observed: Float[np.ndarray, "time 3"], predicted: Float[np.ndarray, "later 3"], title: str
 ) -> Figure:
-    """Observed and predicted path of one recording from the side (paper, figure 14, last panel).
-
-    Args:
-        observed: Centre of mass in the action frame [m].
-        predicted: The same as predicted.
-        title: What the recording is called.
-    """
+    """Observed and predicted centre of mass [m] of one recording from the side (paper, figure 14, last panel)."""
     fig = new_figure(6.4, 6.4)
     ax = fig.subplots()
     draw_paths(ax, {"observed": observed, "predicted": predicted}, title)

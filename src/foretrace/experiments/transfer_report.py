@@ -71,9 +71,6 @@ OBJECT_TITLES = {
 def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     """Everything that the tables tell, JSON-able.
 
-    Args:
-        rows: Of `foretrace.experiments.transfer.Transfer`.
-
     Returns:
         ``edges``: one entry for each edge of a printed or recorded shape; ``objects``: one for each other object;
         ``bars``: which means and which single lever-ups lie below the bars; ``outcomes``: how many there are of each;
@@ -149,12 +146,7 @@ def bar_lines(summary: Mapping[str, Any], observed: str = "stand-in") -> list[st
 
 
 def report(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
-    """The paper's tables 1 and 2 and figure 15b with ours beside them; of recordings, every interaction, too.
-
-    Args:
-        summary: As `summarise` makes it.
-        rows: What it was made of.
-    """
+    """The paper's tables 1 and 2 and figure 15b with ours beside them; of recordings, every interaction, too."""
     recorded, times = RECORDED in set(rows["group"]), f"{summary['repeats']} lever-ups at each"
     if recorded:
         parts, observed = ["# Predictions against recorded lever-ups"], RECORDED

@@ -222,11 +222,7 @@ class Uncertainty(Experiment):
 
 
 def load(data: str | Path, like: InteractionBatch | None = None) -> InteractionBatch:
-    """All interactions that have a motion to learn from, whatever their outcome.
-
-    Args:
-        data: Folder of the data set.
-        like: Others that have to be sampled at the same times.
+    """All interactions that have a motion to learn from, sampled at the same times as the other ones, if any.
 
     Raises:
         DatasetError: There is no data set, none of its interactions has two samples, or they are sampled otherwise.

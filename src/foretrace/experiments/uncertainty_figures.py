@@ -25,11 +25,7 @@ FOUND = [10, 25, 50, 75, 90]
 
 @styled
 def reliability_figure(rows: pd.DataFrame) -> Figure:
-    """Share of motions within regions against their levels, a panel for each split.
-
-    Args:
-        rows: As from `foretrace.experiments.uncertainty.measure`, with ``seed`` and ``split``.
-    """
+    """Share of motions within regions against their levels, a panel for each split."""
     splits = list(dict.fromkeys(rows["split"]))
     fig = new_figure(4.4 * len(splits) + 0.4, 5.0)
     for ax, split in zip(fig.subplots(1, len(splits), squeeze=False, sharey=True)[0], splits, strict=True):
@@ -83,11 +79,7 @@ def _chance_band(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
 
 @styled
 def observed_figure(rows: pd.DataFrame) -> Figure:
-    """Errors of the rest of motions against how many samples were observed, a panel for each beginning and split.
-
-    Args:
-        rows: As for `reliability_figure`.
-    """
+    """Errors of the rest of motions against how many samples were observed, a panel for each beginning and split."""
     splits = list(dict.fromkeys(rows["split"]))
     groups = [name for name in MARKERS if name in set(rows.loc[rows["metric"].eq("record_rest"), "group"])]
     fig = new_figure(9.0, 0.9 + 3.2 * len(splits))
@@ -144,11 +136,7 @@ def _color(group: str) -> str:
 
 @styled
 def confusion_figure(rows: pd.DataFrame) -> Figure:
-    """Which outcomes are taken for which, a panel for each split; counts of all seeds together.
-
-    Args:
-        rows: As for `reliability_figure`.
-    """
+    """Which outcomes are taken for which, a panel for each split; counts of all seeds together."""
     splits = list(dict.fromkeys(rows["split"]))
     names = list(dict.fromkeys(rows.loc[rows["metric"].eq("count_test"), "group"]))
     side = 1.6 + 1.0 * len(names)
