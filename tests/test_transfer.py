@@ -326,7 +326,8 @@ def table_of(means: dict[str, list[float]], outcome: str = "levered") -> pd.Data
 
 
 def test_the_summary_has_the_papers_numbers_beside_ours() -> None:
-    summary = summarise(table_of({"pentagon": [0.2, 0.3, 0.4, 0.45, 0.55]}))
+    table = table_of({"pentagon": [0.2, 0.3, 0.4, 0.45, 0.55]})
+    summary = summarise(table)
     assert [edge["paper"]["predicted"] for edge in summary["edges"]] == list(PAPER_PREDICTED["pentagon"])
     assert summary["edges"][4]["predicted"] == {"mean": 0.55, "sd": 0.1414, "max": 0.65}
     paper, goal = summary["bars"]
@@ -337,16 +338,17 @@ def test_the_summary_has_the_papers_numbers_beside_ours() -> None:
     assert goal["predicted"]["means_below"] == 4
     assert goal["predicted"]["share_of_lever_ups"] == pytest.approx(0.7)
     assert "under 1 cm on average, stand-in against predicted: yes (5 of 5; 100 %" in bar_lines(summary)[0]
-    lines = report(summary).splitlines()
+    lines = report(summary, table).splitlines()
     assert "| Paper: real vs predicted | 0.981 | 0.446 | 0.480 | 0.611 | 0.401 |" in lines
     assert "| Stand-in vs predicted, mean | 0.200 | 0.300 | 0.400 | 0.450 | 0.550 |" in lines
 
 
 def test_what_has_no_distance_is_below_no_bar() -> None:
-    summary = summarise(table_of({"pentagon": [0.2, np.nan]}, outcome="failed"))
+    table = table_of({"pentagon": [0.2, np.nan]}, outcome="failed")
+    summary = summarise(table)
     assert not summary["bars"][0]["predicted"]["holds"]
     assert summary["edges"][1]["predicted"] == {"mean": None, "sd": None, "max": None}
-    assert "| Not levered | 2 failed | 2 failed |" in report(summary)
+    assert "| Not levered | 2 failed | 2 failed |" in report(summary, table)
     json.dumps(summary, allow_nan=False)
 
 

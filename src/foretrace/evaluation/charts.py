@@ -173,6 +173,12 @@ def grid(ax: Axes, **settings: Any) -> None:
     ax.set(**settings)
 
 
+def mesh(ax: Axes) -> None:
+    """Light lines in both directions."""
+    ax.grid(color=GRID, linewidth=0.6)
+    ax.set_axisbelow(True)
+
+
 def legend(fig: Figure, names: Iterable[str], extra: Sequence[Line2D] = (), *, lines: bool = True) -> None:
     """All that is drawn, below the axes."""
     handles = [
@@ -190,14 +196,7 @@ def reference(ax: Axes, at: float) -> None:
 
 
 def draw_boxes(ax: Axes, rows: pd.DataFrame, names: Sequence[str], marks: pd.DataFrame | None = None) -> None:
-    """A box over the seeds for each predictor, every seed as a dot, families kept together.
-
-    Args:
-        ax: Where to draw.
-        rows: Errors [cm] of one setting.
-        names: Predictors, in order.
-        marks: Errors of another setting, drawn as their mean.
-    """
+    """A box over the seeds for each predictor, every seed as a dot; marks are drawn as their mean. Errors in cm."""
     rng = np.random.default_rng(0)
     place, ticks = 0.0, []
     for family in FAMILIES:

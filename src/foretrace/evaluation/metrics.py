@@ -22,10 +22,6 @@ def evaluate_predictor(predictor: EffectPredictor, batch: InteractionBatch) -> l
 
     Trajectories count up to where the object slipped off the blade.
 
-    Args:
-        predictor: The predictor.
-        batch: The interactions to evaluate it on.
-
     Returns:
         Rows with ``group`` (``all``, an outcome, or a number of corners such as ``4 corners``), ``metric`` (``full``:
         mean distance over the trajectory; ``final``: at its end), ``start`` (``observed``: the first sample was given;
@@ -62,11 +58,6 @@ def pose_errors(
     valid: Bool[np.ndarray, "batch time"],
 ) -> dict[str, Float[np.ndarray, " batch"]]:
     """Distances of imagined poses from observed ones, averaged over time.
-
-    Args:
-        imagined: As ``ImaginedBatch.pose``.
-        batch: The observed interactions.
-        valid: The samples that count.
 
     Returns:
         ``rotation``: geodesic angle [degrees]. ``add``: mean distance of the object's lower and upper corners [cm]
@@ -113,11 +104,6 @@ def measure_errors(
     predictor: EffectPredictor, batch: InteractionBatch, inputs: Shaped[Tensor, "batch ..."]
 ) -> dict[str, float]:
     """Errors of trajectories imagined from the observed first sample (paper, section 5.2), in cm.
-
-    Args:
-        predictor: The predictor.
-        batch: What it is evaluated on.
-        inputs: The inputs of its features for that.
 
     Returns:
         ``full`` and ``final``, means over the interactions; ``full_median`` and ``final_median``. Of a predictor of

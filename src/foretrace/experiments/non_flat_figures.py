@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
-from foretrace.pictures.style import DPI, INK, STYLE
+from foretrace.evaluation.charts import BLUE, GREEN, VERMILLION, finish, grid, mesh
+from foretrace.evaluation.tables import capitalised
+from foretrace.pictures.style import INK, new_figure, styled
 
 COLORS = {"mask": VERMILLION, "height": BLUE}
 WORDS = {"mask": "mask", "height": "height map"}
@@ -22,32 +22,25 @@ PATHS: dict[str, tuple[str, Any, float]] = {
 }
 
 
+@styled
 def errors_figure(settings: Mapping[str, Any], paper: Mapping[str, float]) -> Figure:
-    """Errors of both channels by kind of object, one panel for each split.
-
-    Args:
-        settings: As `foretrace.experiments.non_flat.NonFlat.summarise` makes them.
-        paper: The paper's errors [cm].
-    """
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(max(7.4, 5.6 * len(settings)), 4.2), dpi=DPI, layout="constrained")
-        panels = fig.subplots(1, len(settings), squeeze=False, sharey=True)[0]
-        for ax, (setting, found) in zip(panels, settings.items(), strict=True):
-            _draw_groups(ax, found["groups"], paper)
-            words = {"by-outline": "No outline in two parts", "random": "Split at random"}[setting]
-            count = len(found["seeds"])
-            ax.set_title(f"{words}; {count} seed{'s' if count > 1 else ''}")
-        panels[0].set_ylabel("full-trajectory error [cm]")
-        handles: list[Patch | Line2D] = [
-            Patch(facecolor=color, alpha=0.55, edgecolor=color, label=f"has the {WORDS[name]}")
-            for name, color in COLORS.items()
-        ]
-        handles.append(
-            Line2D([], [], color=INK, marker="D", linestyle="none", label="paper, its own objects")
-        )
-        fig.legend(handles=handles, loc="outside lower center", ncols=3)
-        note = "The same predictor and lever-ups; means over the seeds, with 95 % intervals if several"
-        finish(fig, "What the height map adds to the mask", note)
+    """Errors of both channels by kind of object, one panel for each split."""
+    fig = new_figure(max(7.4, 5.6 * len(settings)), 4.2)
+    panels = fig.subplots(1, len(settings), squeeze=False, sharey=True)[0]
+    for ax, (setting, found) in zip(panels, settings.items(), strict=True):
+        _draw_groups(ax, found["groups"], paper)
+        words = {"by-outline": "No outline in two parts", "random": "Split at random"}[setting]
+        count = len(found["seeds"])
+        ax.set_title(f"{words}; {count} seed{'s' if count > 1 else ''}")
+    panels[0].set_ylabel("full-trajectory error [cm]")
+    handles: list[Patch | Line2D] = [
+        Patch(facecolor=color, alpha=0.55, edgecolor=color, label=f"has the {WORDS[name]}")
+        for name, color in COLORS.items()
+    ]
+    handles.append(Line2D([], [], color=INK, marker="D", linestyle="none", label="paper, its own objects"))
+    fig.legend(handles=handles, loc="outside lower center", ncols=3)
+    note = "The same predictor and lever-ups; means over the seeds, with 95 % intervals if several"
+    finish(fig, "What the height map adds to the mask", note)
     return fig
 
 
@@ -72,39 +65,33 @@ def _draw_groups(ax: Axes, groups: Mapping[str, Any], paper: Mapping[str, float]
     ax.set_ylim(0, None)
 
 
+@styled
 def paths_figure(paths: pd.DataFrame) -> Figure:
-    """Observed and imagined paths of objects that look alike, from the side (paper, figure 16, right).
-
-    Args:
-        paths: As from `foretrace.experiments.non_flat.example_paths`, of at least one object.
-    """
+    """Observed and imagined paths of objects that look alike, from the side (paper, figure 16, right)."""
     kinds = list(dict.fromkeys(paths["kind"]))
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(4.2 * len(kinds), 4.0), dpi=DPI, layout="constrained")
-        for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False, sharey=True)[0], kinds, strict=True):
-            mine = paths.loc[paths["kind"].eq(kind)]
-            for name, (color, style, width) in PATHS.items():
-                path = mine.loc[mine["path"].eq(name)]
-                x, z = path["x_cm"].to_numpy(float), path["z_cm"].to_numpy(float)
-                ax.plot(x, z, color=color, linestyle=style, linewidth=width)
-                ax.plot(x[-1:], z[-1:], "o", color=color, markersize=5)
-                if name == "observed":
-                    ax.plot(x[:1], z[:1], "s", color=INK, markersize=5, zorder=5)
-            ax.set_title(f"{kind[:1].upper()}{kind[1:]}: {mine['outcome'].iloc[0]}")
-            ax.set_xlabel("x, along the action [cm]")
-            ax.grid(color=GRID, linewidth=0.6)
-            ax.set_axisbelow(True)
-        fig.axes[0].set_ylabel("z, up [cm]")
-        handles = [
-            Line2D([], [], color=color, linestyle=style, linewidth=width, label=words)
-            for words, (color, style, width) in zip(
-                ("observed", "imagined from the mask", "imagined from the height map"),
-                PATHS.values(),
-                strict=True,
-            )
-        ]
-        handles.append(Line2D([], [], color=INK, marker="s", linestyle="none", label="at rest"))
-        fig.legend(handles=handles, loc="outside lower center", ncols=4)
-        note = "A lever-up of the test part at one contact; each panel has its own scale along x"
-        finish(fig, "One mask, three motions: paths of the centre of mass from the side", note)
+    fig = new_figure(4.2 * len(kinds), 4.0)
+    for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False, sharey=True)[0], kinds, strict=True):
+        mine = paths.loc[paths["kind"].eq(kind)]
+        for name, (color, style, width) in PATHS.items():
+            path = mine.loc[mine["path"].eq(name), ["x_cm", "z_cm"]].to_numpy(float)
+            ax.plot(*path.T, color=color, linestyle=style, linewidth=width)
+            ax.plot(*path[-1:].T, "o", color=color, markersize=5)
+            if name == "observed":
+                ax.plot(*path[:1].T, "s", color=INK, markersize=5, zorder=5)
+        ax.set_title(f"{capitalised(kind)}: {mine['outcome'].iloc[0]}")
+        ax.set_xlabel("x, along the action [cm]")
+        mesh(ax)
+    fig.axes[0].set_ylabel("z, up [cm]")
+    handles = [
+        Line2D([], [], color=color, linestyle=style, linewidth=width, label=words)
+        for words, (color, style, width) in zip(
+            ("observed", "imagined from the mask", "imagined from the height map"),
+            PATHS.values(),
+            strict=True,
+        )
+    ]
+    handles.append(Line2D([], [], color=INK, marker="s", linestyle="none", label="at rest"))
+    fig.legend(handles=handles, loc="outside lower center", ncols=4)
+    note = "A lever-up of the test part at one contact; each panel has its own scale along x"
+    finish(fig, "One mask, three motions: paths of the centre of mass from the side", note)
     return fig

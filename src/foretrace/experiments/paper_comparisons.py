@@ -99,12 +99,8 @@ def _count_of_all(batch: InteractionBatch, setting: str, seed: int, proportional
             "or choose smaller settings"
         )
     order = np.random.default_rng(seed).permutation(len(batch))
-    ends = np.cumsum([validation, test, int(setting)])
-    return Split(
-        train=np.sort(order[ends[1] : ends[2]]),
-        validation=np.sort(order[: ends[0]]),
-        test=np.sort(order[ends[0] : ends[1]]),
-    )
+    parts = np.split(order, np.cumsum([validation, test, int(setting)]))
+    return Split(train=np.sort(parts[2]), validation=np.sort(parts[0]), test=np.sort(parts[1]))
 
 
 def _novel_corners(batch: InteractionBatch, setting: str, seed: int, proportional: bool) -> Split:
@@ -115,18 +111,10 @@ def _percent(setting: str, whole: int) -> int:
     return max(1, round(int(setting) / 100 * whole))
 
 
-def _ratio_of_share(setting: str) -> float:
-    return TEST_TO_TRAIN / (int(setting) / 100)
-
-
 def _ratio_of_all(setting: str) -> float:
     """Of the paper's 1814 levered interactions, 100 validate."""
     train = int(setting) / 100
     return (1 - train - 100 / 1814) / train
-
-
-def _ratio_of_count(setting: str) -> float:
-    return PAPER_SIZES[2] / int(setting)
 
 
 def _ratio_of_corners(setting: str) -> float:
@@ -159,11 +147,8 @@ ABLATIONS: dict[str, tuple[str, Mapping[str, Option]]] = {
 
 COMPARISONS: dict[str, Comparison] = {
     "support-points": Comparison(
-        _SUPPORT,
-        ("5", "10", "25", "50", "75", "100"),
-        _share_of_training,
-        ratio=_ratio_of_share,
-        of_corners=True,
+        _SUPPORT, ("5", "10", "25", "50", "75", "100"), _share_of_training, of_corners=True,
+        ratio=lambda setting: TEST_TO_TRAIN / (int(setting) / 100),
     ),
     "support-points-novel": Comparison(
         _SUPPORT, CORNERS, _novel_corners, ratio=_ratio_of_corners, of_corners=True
@@ -179,14 +164,11 @@ COMPARISONS: dict[str, Comparison] = {
     "steps-ahead": Comparison(_FEATURES, ("2", "3", "4", "5"), shuffled, varies_steps=True),
     "novel-corners": Comparison(_ALL, CORNERS, _novel_corners, ratio=_ratio_of_corners),
     "more-data": Comparison(
-        ("none", *_OTHERS),
-        ("2000", "5000", "10000", "20000"),
-        _count_of_all,
-        ratio=_ratio_of_count,
-        on_request=True,
+        ("none", *_OTHERS), ("2000", "5000", "10000", "20000"), _count_of_all, on_request=True,
+        ratio=lambda setting: PAPER_SIZES[2] / int(setting),
     ),
     "ablation": Comparison(tuple(ABLATIONS), ("shuffled",), shuffled, predictors=ABLATIONS),
-}
+}  # fmt: skip
 """The paper's comparisons by name: figures 9a, 9b, 10, 11, 12 and 13.
 
 Two ask what our choices change: in ``support-points-plain`` the network sees corners in the action frame and predicts
@@ -215,13 +197,7 @@ def plan(
     """The trials that the paper's comparisons consist of.
 
     Experiment by experiment, in each of them all that one seed asks for before the next seed: whenever it is
-    interrupted, what is there can be compared.
-
-    Args:
-        experiments: Which of COMPARISONS, in this order; by default all but those on request.
-        features: Which features; by default all.
-        settings: Which settings; by default all.
-        seeds: Seeds of splits and trainings.
+    interrupted, what is there can be compared. What is not named is compared in full, but for what is on request.
 
     Raises:
         ResultsError: One of them is unknown, or they do not go together.
@@ -249,11 +225,5 @@ def plan(
 
 
 def split_of(trial: PaperTrial, batch: InteractionBatch, proportional: bool = False) -> Split:
-    """Training, validation and test part of a trial.
-
-    Args:
-        trial: The trial.
-        batch: The levered interactions.
-        proportional: Take the paper's proportions instead of its 1400, 100 and 300 interactions.
-    """
+    """Parts of the levered interactions, in the paper's sizes or in its proportions."""
     return COMPARISONS[trial.experiment].split(batch, trial.setting, trial.seed, proportional)

@@ -4,8 +4,10 @@ A figure draws whatever rows there are, says how many seeds are behind it, and i
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import chain
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -36,7 +38,7 @@ from foretrace.experiments.paper_claims import (
     TASK_SPECIFIC,
 )
 from foretrace.experiments.paper_comparisons import COMPARISONS
-from foretrace.pictures.style import DPI, INK, STYLE
+from foretrace.pictures.style import INK, new_figure, styled
 
 PANELS = {
     "Shape context": SHAPE_CONTEXTS,
@@ -57,7 +59,7 @@ def last(numbers: np.ndarray) -> float:
     return float(numbers[np.isfinite(numbers[:, 0])][-1, 0])
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_9a(table: pd.DataFrame) -> Figure | None:
     """Accuracy of predicted support points against the size of the training set."""
     rows = rows_of(table, "support-points", "accuracy")
@@ -65,7 +67,7 @@ def figure_9a(table: pd.DataFrame) -> Figure | None:
         return None
     settings = sorted(set(rows["setting"]), key=float)
     x = [float(setting) for setting in settings]
-    fig = Figure(figsize=(7.2, 4.4), dpi=DPI, layout="constrained")
+    fig = new_figure(7.2, 4.4)
     ax = fig.add_subplot()
     grid(ax, ylim=(0, 103), xlim=(0, 103), xlabel="training interactions used [%]", ylabel="accuracy [%]")
     ends = {}
@@ -79,13 +81,13 @@ def figure_9a(table: pd.DataFrame) -> Figure | None:
     return fig
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_9b(table: pd.DataFrame) -> Figure | None:
     """Accuracy of predicted support points on corner counts that were not learned from."""
     rows = rows_of(table, "support-points-novel", "accuracy", PAIRS)
     if rows.empty:
         return None
-    fig = Figure(figsize=(7.2, 4.4), dpi=DPI, layout="constrained")
+    fig = new_figure(7.2, 4.4)
     ax = fig.add_subplot()
     grid(ax, ylim=(0, 103), ylabel="accuracy [%]", xlabel="corner counts held out of the training")
     names = present(rows)
@@ -114,14 +116,14 @@ def draw_groups(ax: Axes, rows: pd.DataFrame, names: Sequence[str], scale: float
     return offsets
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_10(table: pd.DataFrame, metric: str) -> Figure | None:
     """Errors of all predictors on the paper's split: the boxes of figure 10."""
     rows = rows_of(table, "features", metric, ["shuffled"])
     if rows.empty:
         return None
     ahead = rows_of(table, "half-plane", metric, ["shuffled"])
-    fig = Figure(figsize=(7.6, 4.5), dpi=DPI, layout="constrained")
+    fig = new_figure(7.6, 4.5)
     ax = fig.add_subplot()
     draw_boxes(ax, rows, present(rows), ahead)
     ax.set_ylabel(ERRORS[metric])
@@ -132,23 +134,13 @@ def figure_10(table: pd.DataFrame, metric: str) -> Figure | None:
     return fig
 
 
-def figure_10a(table: pd.DataFrame) -> Figure | None:
-    """Error over the full trajectory, all predictors."""
-    return figure_10(table, "full")
-
-
-def figure_10b(table: pd.DataFrame) -> Figure | None:
-    """Error of the final position, all predictors."""
-    return figure_10(table, "final")
-
-
-@mpl.rc_context(STYLE)
+@styled
 def figure_10_by_object(table: pd.DataFrame) -> Figure | None:
     """The same errors where no object is in two parts, beside the paper's split."""
     by_object = {metric: rows_of(table, "features", metric, ["by-object"]) for metric in ERRORS}
     if all(rows.empty for rows in by_object.values()):
         return None
-    fig = Figure(figsize=(13.2, 4.5), dpi=DPI, layout="constrained")
+    fig = new_figure(13.2, 4.5)
     for ax, (metric, rows) in zip(fig.subplots(1, 2), by_object.items(), strict=True):
         draw_boxes(ax, rows, present(rows), rows_of(table, "features", metric, ["shuffled"]))
         ax.set_ylabel(ERRORS[metric])
@@ -159,67 +151,65 @@ def figure_10_by_object(table: pd.DataFrame) -> Figure | None:
 
 
 def draw_panels(
-    fig: Figure, rows: pd.DataFrame, experiment: str, settings: Sequence[str], x: Sequence[float]
-) -> list[Axes]:
+    rows: pd.DataFrame, experiment: str, settings: Sequence[str], title: str, **axis: Any
+) -> Figure:
     """Curves of all predictors, a panel for each family; the others are behind them in grey."""
+    x = [float(setting) for setting in settings]
     ratio = COMPARISONS[experiment].ratio
     numbers = {name: intervals(rows, name, settings, ratio=ratio) for name in present(rows)}
-    panels = {title: [name for name in names if name in numbers] for title, names in PANELS.items()}
-    panels["Others"] = [
-        name for name in numbers if name != "none" and not any(name in p for p in PANELS.values())
-    ]
+    in_some = {"none", *chain(*PANELS.values())}
+    families = PANELS | {"Others": tuple(name for name in numbers if name not in in_some)}
+    panels = {title: [name for name in names if name in numbers] for title, names in families.items()}
     panels = {title: names for title, names in panels.items() if names} or {"No feature": []}
+    fig = new_figure(13.2, 4.3)
     axes = fig.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     top = 1.06 * max(np.nanmax(part) for part in numbers.values())
-    for ax, (title, names) in zip(axes, panels.items(), strict=True):
+    for ax, (family, names) in zip(axes, panels.items(), strict=True):
         shown = [name for name in ("none", *names) if name in numbers]
         for name, values in numbers.items():
             if name not in shown:
                 known = np.isfinite(values[:, 0])
                 ax.plot(np.asarray(x)[known], values[known, 0], color=BACKGROUND, linewidth=1, zorder=1)
-        grid(ax, ylim=(0, top), title=title)
+        grid(ax, ylim=(0, top), title=family)
         for name in shown:
             draw_line(ax, x, numbers[name], style_of(name))
         label_ends(ax, {name: last(numbers[name]) for name in shown})
+        ax.set(**axis)
     axes[0].set_ylabel(ERRORS["full"])
-    return list(axes)
+    note = f"means and 95 % intervals over {seeds_in_words(rows)}; grey: the other families"
+    finish(fig, f"Error against the {title}", note)
+    return fig
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_11(table: pd.DataFrame) -> Figure | None:
     """Error against the size of the training set."""
     rows = rows_of(table, "training-size", "full", SIZES)
     if rows.empty:
         return None
-    fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
-    for ax in draw_panels(fig, rows, "training-size", SIZES, [float(size) for size in SIZES]):
+    fig = draw_panels(
+        rows, "training-size", SIZES, "size of the training set", xlabel="data used for training [%]"
+    )
+    for ax in fig.axes:
         ax.set_xscale("log", base=2)
         ax.set_xticks([float(size) for size in SIZES], SIZES)
         ax.minorticks_off()
-        ax.set_xlabel("data used for training [%]")
-    finish(fig, "Error against the size of the training set",
-           f"means and 95 % intervals over {seeds_in_words(rows)}; grey: the other families")  # fmt: skip
     return fig
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_12(table: pd.DataFrame) -> Figure | None:
     """Error against the number of states predicted at once."""
     several = rows_of(table, "steps-ahead", "full", STEPS)
     if several.empty:
         return None
     one = rows_of(table, "features", "full", ["shuffled"]).assign(setting="1")
-    pairs = several[["features", "seed"]].drop_duplicates()
-    rows = pd.concat([one.merge(pairs), several])
-    fig = Figure(figsize=(13.2, 4.3), dpi=DPI, layout="constrained")
-    for ax in draw_panels(fig, rows, "steps-ahead", ("1", *STEPS), [1.0, 2.0, 3.0, 4.0, 5.0]):
-        ax.set(xticks=range(1, 6), xlim=(0.7, 5.3), xlabel="states predicted at once, n")
-    finish(fig, "Error against the number of states predicted at once",
-           f"means and 95 % intervals over {seeds_in_words(rows)}; grey: the other families")  # fmt: skip
-    return fig
+    rows = pd.concat([one.merge(several[["features", "seed"]].drop_duplicates()), several])
+    axis = {"xticks": range(1, 6), "xlim": (0.7, 5.3), "xlabel": "states predicted at once, n"}
+    return draw_panels(rows, "steps-ahead", ("1", *STEPS), "number of states predicted at once", **axis)
 
 
-@mpl.rc_context(STYLE)
+@styled
 def figure_13(table: pd.DataFrame) -> Figure | None:
     """Error on corner counts that were not learned from."""
     rows = rows_of(table, "novel-corners", "full", PAIRS)
@@ -227,7 +217,7 @@ def figure_13(table: pd.DataFrame) -> Figure | None:
         return None
     shuffled = rows_of(table, "features", "full", ["shuffled"])
     names = present(rows)
-    fig = Figure(figsize=(13.2, 4.9), dpi=DPI, layout="constrained")
+    fig = new_figure(13.2, 4.9)
     ax = fig.add_subplot()
     for name, offset in zip(names, draw_groups(ax, rows, names), strict=True):
         mean = shuffled.loc[shuffled["features"].eq(name), "value"].mean()
@@ -248,8 +238,8 @@ def figure_13(table: pd.DataFrame) -> Figure | None:
 FIGURES: dict[str, Callable[[pd.DataFrame], Figure | None]] = {
     "figure-9a": figure_9a,
     "figure-9b": figure_9b,
-    "figure-10a": figure_10a,
-    "figure-10b": figure_10b,
+    "figure-10a": partial(figure_10, metric="full"),
+    "figure-10b": partial(figure_10, metric="final"),
     "figure-10-by-object": figure_10_by_object,
     "figure-11": figure_11,
     "figure-12": figure_12,

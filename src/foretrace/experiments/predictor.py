@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib as mpl
 import pandas as pd
 from matplotlib.figure import Figure
 from tyro.conf import Positional
@@ -19,7 +18,7 @@ from foretrace.evaluation.tables import markdown_table, number
 from foretrace.experiments import SUMMARIES
 from foretrace.files import read_json, short_hash
 from foretrace.interactions.dataset import Dataset, InteractionBatch
-from foretrace.pictures.style import DPI, STYLE
+from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor import load_predictor, part_of
 from foretrace.predictor.run_folder import fingerprint
 
@@ -87,22 +86,22 @@ class Predictor(Experiment):
             parts += [f"## {where}, in cm", errors_tables(starts)]
         return "\n\n".join(parts) + "\n"
 
+    @styled
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
         """Mean and 95th percentile of the errors over the full trajectory by group."""
         full = rows.loc[rows["metric"].eq("full") & rows["start"].eq("observed") & rows["part"].eq(self.part)]
         if full.empty:
             return {}
-        with mpl.rc_context(STYLE):
-            fig = Figure(figsize=(max(6.4, 0.8 * len(full)), 4.2), dpi=DPI, layout="constrained")
-            ax = fig.subplots()
-            ax.bar(range(len(full)), full["p95_cm"], color=SKY, alpha=0.35, label="95th percentile")
-            ax.bar(range(len(full)), full["mean_cm"], color=BLUE, label="mean", width=0.6)
-            ax.set_xticks(
-                range(len(full)), [f"{g}\n({n})" for g, n in zip(full["group"], full["count"], strict=True)]
-            )
-            grid(ax, ylim=(0, None), ylabel="error, full trajectory [cm]")
-            fig.legend(loc="outside lower center", ncols=2)
-            finish(fig, "Errors by outcome and number of corners", "number of interactions in brackets")
+        fig = new_figure(max(6.4, 0.8 * len(full)), 4.2)
+        ax = fig.subplots()
+        ax.bar(range(len(full)), full["p95_cm"], color=SKY, alpha=0.35, label="95th percentile")
+        ax.bar(range(len(full)), full["mean_cm"], color=BLUE, label="mean", width=0.6)
+        ax.set_xticks(
+            range(len(full)), [f"{g}\n({n})" for g, n in zip(full["group"], full["count"], strict=True)]
+        )
+        grid(ax, ylim=(0, None), ylabel="error, full trajectory [cm]")
+        fig.legend(loc="outside lower center", ncols=2)
+        finish(fig, "Errors by outcome and number of corners", "number of interactions in brackets")
         return {"errors": fig}
 
     @cached_property

@@ -76,12 +76,7 @@ class Shown(NamedTuple):
 
 
 def open_both(plain: str | Path, varied: str | Path, names: Sequence[str] = NAMES) -> Both:
-    """Read both data sets.
-
-    Args:
-        plain: Folder of the plain data.
-        varied: Folder of the randomised data.
-        names: What must vary in the second only.
+    """Read plain and randomised data; the names are of what must vary in the second only.
 
     Raises:
         DatasetError: One of them is missing or damaged.

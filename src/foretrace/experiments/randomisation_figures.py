@@ -1,6 +1,5 @@
 """The compared predictors and tests of randomised training data, and their picture."""
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -9,7 +8,7 @@ from matplotlib.patches import Patch
 
 from foretrace.evaluation.charts import BLUE, GREEN, ORANGE, finish, grid, seeds_in_words
 from foretrace.evaluation.statistics import interval
-from foretrace.pictures.style import DPI, GREY, INK, STYLE
+from foretrace.pictures.style import GREY, INK, new_figure, styled
 
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"
 SETTINGS = (PLAIN, VARIED, KNOWING)
@@ -60,11 +59,11 @@ def tests_of(table: pd.DataFrame) -> dict[str, str]:
     return {test: metric for test, metric in TESTS.items() if metric in metrics}
 
 
-@mpl.rc_context(STYLE)
+@styled
 def randomisation_figure(table: pd.DataFrame) -> Figure:
     """Errors of all predictors, a panel for each kind of features."""
     labels = list(dict.fromkeys(table["features"]))
-    fig = Figure(figsize=(9.6, 1.0 + 2.5 * len(labels)), dpi=DPI, layout="constrained")
+    fig = new_figure(9.6, 1.0 + 2.5 * len(labels))
     axes = fig.subplots(len(labels), 1, squeeze=False)[:, 0]
     for ax, features in zip(axes, labels, strict=True):
         _draw(ax, table, features)

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import torch
@@ -25,7 +24,7 @@ from foretrace.experiments import SUMMARIES
 from foretrace.features.autoencoder import AutoencoderFeatures
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.topdown import VIEW_SIZE
-from foretrace.pictures.style import DPI, INK, STYLE
+from foretrace.pictures.style import DPI, INK, styled
 from foretrace.predictor import EffectPredictor, load_predictor, part_of
 from foretrace.predictor.run_folder import fingerprint
 
@@ -89,8 +88,9 @@ class Reconstruction(Experiment):
             str(name): {
                 "features": part["features"].iloc[0],
                 "iou_mean": round(float(np.mean(part["iou"].to_numpy(float))), 4),
+                "iou_worst": round(float(part["iou"].min()), 4),
+                "masks": len(part),
             }
-            | {"iou_worst": round(float(np.min(part["iou"].to_numpy(float))), 4), "masks": len(part)}
             for name, part in rows.groupby("training", sort=False)
         }
 
@@ -159,36 +159,26 @@ def overlap(one: Masks, other: Masks) -> Float[np.ndarray, " batch"]:
     return np.where(union == 0, 1.0, (one & other).sum(axis=(1, 2)) / np.maximum(union, 1))
 
 
+@styled
 def reconstruction_figure(masks: Masks, restored: Mapping[str, Masks]) -> Figure:
-    """Masks above what each code made of them.
-
-    Args:
-        masks: As seen; one column each.
-        restored: What was made of the same masks, by the code's name; one row each.
-    """
+    """Masks, a column each, above what each code, by name, made of them."""
     colors = ListedColormap([BLANK, KEPT, LOST, ADDED])
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(1.25 * len(masks) + 0.6, 1.35 * (1 + len(restored)) + 0.5), dpi=DPI)
-        axes = figure.subplots(1 + len(restored), len(masks), squeeze=False)
-        for row, (name, made) in enumerate({"mask": masks, **restored}.items()):
-            scores = overlap(masks, made)
-            for column, ax in enumerate(axes[row]):
-                codes = (
-                    masks[column] * 1 + (masks[column] & ~made[column]) + 3 * (made[column] & ~masks[column])
+    figure = Figure(figsize=(1.25 * len(masks) + 0.6, 1.35 * (1 + len(restored)) + 0.5), dpi=DPI)
+    axes = figure.subplots(1 + len(restored), len(masks), squeeze=False)
+    for row, (name, made) in enumerate({"mask": masks, **restored}.items()):
+        scores = overlap(masks, made)
+        for column, ax in enumerate(axes[row]):
+            codes = masks[column] * 1 + (masks[column] & ~made[column]) + 3 * (made[column] & ~masks[column])
+            ax.imshow(codes, cmap=colors, vmin=-0.5, vmax=3.5, interpolation="nearest")
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set_visible(False)
+            if row:
+                ax.set_title(
+                    f"IoU {scores[column]:.3f}", fontsize=7.5, fontweight="normal", loc="center", pad=2
                 )
-                ax.imshow(codes, cmap=colors, vmin=-0.5, vmax=3.5, interpolation="nearest")
-                ax.set(xticks=[], yticks=[])
-                ax.spines[:].set_visible(False)
-                if row:
-                    ax.set_title(
-                        f"IoU {scores[column]:.3f}", fontsize=7.5, fontweight="normal", loc="center", pad=2
-                    )
-            axes[row, 0].set_ylabel(name, color=INK, fontweight="bold")
-        handles = [
-            Patch(color=KEPT, label="object"),
-            Patch(color=LOST, label="lost"),
-            Patch(color=ADDED, label="added"),
-        ]
-        figure.legend(handles=handles, loc="lower center", ncols=3)
-        figure.subplots_adjust(left=0.07, right=0.995, top=0.97, bottom=0.09, wspace=0.06, hspace=0.16)
+        axes[row, 0].set_ylabel(name, color=INK, fontweight="bold")
+    words = {"object": KEPT, "lost": LOST, "added": ADDED}
+    handles = [Patch(color=color, label=name) for name, color in words.items()]
+    figure.legend(handles=handles, loc="lower center", ncols=3)
+    figure.subplots_adjust(left=0.07, right=0.995, top=0.97, bottom=0.09, wspace=0.06, hspace=0.16)
     return figure

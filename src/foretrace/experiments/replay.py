@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -22,7 +21,7 @@ from foretrace.experiments import SUMMARIES
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix, rotation_angle
 from foretrace.interactions.motions import Recording, read_recordings
-from foretrace.pictures.style import DPI, STYLE
+from foretrace.pictures.style import new_figure, styled
 from foretrace.simulation.free_motion import simulate_free_motion
 
 FACE_TOLERANCE = np.deg2rad(20.0)
@@ -31,6 +30,14 @@ ESTIMATE_TIME = 0.1
 """Velocities that are not recorded are estimated from the frames of this time [s], from at least three."""
 TIMESTEP = 0.001
 """Time step of the simulation [s]."""
+COLUMNS = {
+    "duration_s": ("Time [s]", 1, 2),
+    "mean_position_error_m": ("Position error, mean [cm]", 100, 2),
+    "final_position_error_m": ("Final [cm]", 100, 2),
+    "mean_rotation_error_deg": ("Rotation error, mean [°]", 1, 1),
+    "final_rotation_error_deg": ("Final [°]", 1, 1),
+}
+"""Columns of the report: heading, factor and digits of a number of the summary."""
 
 
 @dataclass(frozen=True)
@@ -75,38 +82,34 @@ class ReplayExperiment(Experiment):
         found = replay(self._read[trial.recording], self.engine, self.timestep)
         start = "estimated" if found.recording.velocity is None else "recorded"
         same = {"start_velocity": start, "down_error_deg": float(np.rad2deg(found.down_error))}
-        times, turned = found.recording.times, np.rad2deg(found.rotation_error)
-        return [
+        rows = pd.DataFrame(
             {
-                "time": float(time),
-                "position_error_m": float(position),
-                "rotation_error_deg": float(rotation),
-                **same,
+                "time": found.recording.times,
+                "position_error_m": found.position_error,
+                "rotation_error_deg": np.rad2deg(found.rotation_error),
             }
-            for time, position, rotation in zip(times, found.position_error, turned, strict=True)
-        ]
+        )
+        return rows.assign(**same).to_dict("records")
 
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
         """The errors of each recording in a few numbers, and the share of those that end on the recorded side."""
         recordings = []
         for name, part in rows.groupby("recording", sort=False):
-            position, turned, down = (
-                part[column].to_numpy(float)
-                for column in ("position_error_m", "rotation_error_deg", "down_error_deg")
-            )
+            position, turned = part["position_error_m"], part["rotation_error_deg"]
+            last = part.iloc[-1]
             recordings.append(
                 {
                     "recording": name,
-                    "duration_s": float(part["time"].iloc[-1]),
+                    "duration_s": float(last["time"]),
                     "frames": len(part),
-                    "start_velocity": part["start_velocity"].iloc[0],
-                    "mean_position_error_m": float(position.mean()),
+                    "start_velocity": last["start_velocity"],
+                    "mean_position_error_m": float(np.mean(position.to_numpy(float))),
                     "largest_position_error_m": float(position.max()),
-                    "final_position_error_m": float(position[-1]),
-                    "mean_rotation_error_deg": float(turned.mean()),
-                    "final_rotation_error_deg": float(turned[-1]),
-                    "down_error_deg": float(down[0]),
-                    "right_face": bool(down[0] < np.rad2deg(FACE_TOLERANCE)),
+                    "final_position_error_m": float(last["position_error_m"]),
+                    "mean_rotation_error_deg": float(np.mean(turned.to_numpy(float))),
+                    "final_rotation_error_deg": float(last["rotation_error_deg"]),
+                    "down_error_deg": float(last["down_error_deg"]),
+                    "right_face": bool(last["down_error_deg"] < np.rad2deg(FACE_TOLERANCE)),
                 }
             )
         share = sum(each["right_face"] for each in recordings) / len(recordings)
@@ -114,44 +117,38 @@ class ReplayExperiment(Experiment):
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """A line for each recording."""
-        head = [
-            "Recording",
-            "Time [s]",
-            "Position error, mean [cm]",
-            "Final [cm]",
-            "Rotation error, mean [°]",
-        ]
-        head += ["Final [°]", "Side down at the end"]
         lines = [
             [
                 each["recording"],
-                f"{each['duration_s']:.2f}",
-                f"{100 * each['mean_position_error_m']:.2f}",
-                f"{100 * each['final_position_error_m']:.2f}",
-                f"{each['mean_rotation_error_deg']:.1f}",
-                f"{each['final_rotation_error_deg']:.1f}",
+                *(f"{scale * each[name]:.{digits}f}" for name, (_, scale, digits) in COLUMNS.items()),
                 "right" if each["right_face"] else "wrong",
             ]
             for each in summary["recordings"]
         ]
+        head = ["Recording", *(words for words, _, _ in COLUMNS.values()), "Side down at the end"]
         return f"# Recorded against simulated motions in {self.engine}\n\n{markdown_table(head, lines)}\n"
 
+    @styled
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
         """Errors of position and rotation over time."""
-        with mpl.rc_context(STYLE):
-            fig = Figure(figsize=(9.6, 4.2), dpi=DPI, layout="constrained")
-            axes = fig.subplots(1, 2)
-            for name, part in rows.groupby("recording", sort=False):
-                style = style_of(str(name))
-                drawn = {"color": style.color, "linestyle": style.line}
-                axes[0].plot(part["time"], 100 * part["position_error_m"], label=str(name), **drawn)
-                axes[1].plot(part["time"], part["rotation_error_deg"], **drawn)
-            grid(axes[0], xlabel="time [s]", ylabel="position error [cm]", ylim=(0, None))
-            grid(axes[1], xlabel="time [s]", ylabel="rotation error [°]", ylim=(0, None))
-            fig.legend(loc="outside lower center", ncols=4)
-            finish(
-                fig, "Simulated against recorded motions", f"both start from the first frame; {self.engine}"
-            )
+        fig = new_figure(9.6, 4.2)
+        axes = fig.subplots(1, 2)
+        for name, part in rows.groupby("recording", sort=False):
+            style = style_of(str(name))
+            for ax, column, scale in zip(
+                axes, ("position_error_m", "rotation_error_deg"), (100, 1), strict=True
+            ):
+                ax.plot(
+                    part["time"],
+                    scale * part[column],
+                    linestyle=style.line,
+                    color=style.color,
+                    label=str(name),
+                )
+        for ax, words in zip(axes, ("position error [cm]", "rotation error [°]"), strict=True):
+            grid(ax, xlabel="time [s]", ylabel=words, ylim=(0, None))
+        fig.legend(handles=axes[0].lines, loc="outside lower center", ncols=4)
+        finish(fig, "Simulated against recorded motions", f"both start from the first frame; {self.engine}")
         return {"errors": fig}
 
     @cached_property
@@ -186,12 +183,7 @@ class Replay:
 def replay(recording: Recording, engine: str = "mujoco", timestep: float = TIMESTEP) -> Replay:
     """Simulates a recorded motion from its first frame and compares.
 
-    A first frame that noise has put into the table is lifted out of it.
-
-    Args:
-        recording: What was recorded.
-        engine: Physics engine.
-        timestep: Time step [s].
+    A first frame that noise has put into the table is lifted out of it. The time step is in seconds.
 
     Raises:
         SimulationError: If the engine is unknown or not installed, or the numbers blow up.

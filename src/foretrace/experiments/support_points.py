@@ -9,12 +9,7 @@ from jaxtyping import Float
 
 from foretrace.errors import TrainingError
 from foretrace.features import FeatureExtractor, FitPart, Option, make_features
-from foretrace.features.support_points import (
-    hull_and_com,
-    named_right,
-    order_points,
-    points_of,
-)
+from foretrace.features.support_points import hull_and_com, named_right, order_points, points_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import Split
 

@@ -39,10 +39,10 @@ from foretrace.experiments.transfer_objects import (
     read_prisms,
     read_silhouettes,
 )
-from foretrace.experiments.transfer_report import PAPER_OBJECTS, RECORDED, recorded_report, report, summarise
+from foretrace.experiments.transfer_report import PAPER_OBJECTS, RECORDED, report, summarise
 from foretrace.imagined.context import true_context
 from foretrace.interactions.dataset import Dataset
-from foretrace.interactions.record import Interaction, Physics
+from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
 from foretrace.predictor import EffectPredictor, load_predictor
 from foretrace.predictor.run_folder import fingerprint
@@ -155,7 +155,7 @@ class Transfer(Experiment):
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """The paper's tables 1 and 2 and figure 15b with ours beside them."""
-        return recorded_report(summary, rows) if RECORDED in set(rows["group"]) else report(summary)
+        return report(summary, rows)
 
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
         """Paths at some printed or at all recorded edges; masks and errors of the other objects."""
@@ -260,14 +260,7 @@ def check_sees(predictor: EffectPredictor) -> None:
 def compare_played(
     predictor: EffectPredictor, played: Played, hull: bool = False, paths: bool = False
 ) -> list[dict[str, Any]]:
-    """Distances of all that was observed at one contact, as rows.
-
-    Args:
-        predictor: The predictor.
-        played: Simulated and observed lever-ups.
-        hull: Whether the predictor has the convex hull of the object's mask.
-        paths: Whether the first row gets the paths, as text.
-    """
+    """Distances of all that was observed at one contact, as rows; the first one may get the paths, as text."""
     exact = played.simulated.view
     own = own_error(predictor, hull_of(exact) if hull else exact, played.simulated)
     rows = []
@@ -298,22 +291,14 @@ def compare(
     view: TopDownView,
     observed: Observation,
     simulated: Interaction,
-    told: Physics | None = None,
 ) -> tuple[dict[str, Any], Float[np.ndarray, "time 3"]]:
     """Distances of one observed path from the simulated and the imagined one.
 
     As in the paper, the roll-out starts where the marker is seen before the action. How much of the distance that
     start takes away is told by ``distance_predicted_from_view_cm``, where it is estimated from the view.
 
-    Args:
-        predictor: The predictor.
-        view: The object from above, as the predictor observes it.
-        observed: What the stand-in showed.
-        simulated: What the simulator of the training data made of it.
-        told: What a predictor that knows physical constants is told of them; by default the stand-in's own.
-
     Returns:
-        The outcomes and distances [cm] as a part of a row; and the imagined path, cut where the observed one ends [m].
+        Outcomes and distances [cm], a part of a row; and the imagined path [m], cut where the observed one ends.
     """
     effect, slip = simulated.effect, observed.slip_time
     slipped_at = None if effect.slip_index is None else float(effect.times[effect.slip_index])
@@ -328,8 +313,7 @@ def compare(
     }
     if len(observed.com) == 0:
         return row, np.empty((0, 3))
-    physics = observed.physics if told is None else told
-    context = true_context(physics, predictor.context)
+    context = true_context(observed.physics, predictor.context)
     start = predictor.imagine(view, context=context, com=observed.com[0])
     imagined = start.com_trajectory[_before(start.times, slip)]
     blind = predictor.imagine(view, context=context)

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -15,19 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.evaluation.charts import BLUE, GREEN, GRID, VERMILLION, finish, grid
+from foretrace.evaluation.charts import BLUE, GREEN, VERMILLION, finish, grid, mesh
 from foretrace.experiments.transfer_objects import Subject
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
-from foretrace.pictures.scene import ARROW_LENGTH
-from foretrace.pictures.style import (
-    CM,
-    DPI,
-    GREY,
-    INK,
-    OBJECT_EDGE,
-    STYLE,
-    TOOL_COLOR,
-)
+from foretrace.pictures.scene import draw_arrow, draw_path, draw_table
+from foretrace.pictures.style import CM, INK, OBJECT_EDGE, TOOL_COLOR, new_figure, styled
 from foretrace.simulation.stand_in import Perturbation, StandIn, hull_of
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
@@ -49,56 +40,49 @@ PATHS_PER_ROW = 4
 """Panels with paths side by side."""
 
 
+@styled
 def objects_figure(
     subjects: Sequence[Subject], rows: pd.DataFrame, stand_in: StandIn, paper: Mapping[str, float]
 ) -> Figure:
-    """Masks of objects as the predictor observes them, and the errors on each (paper, figure 15).
-
-    Args:
-        subjects: The objects.
-        rows: Their lever-ups.
-        stand_in: What played them; it repeats the views.
-        paper: The paper's errors by object [cm].
-    """
+    """Masks of objects as the predictor observes them, and the errors on each (paper, figure 15)."""
     names = [subject.name for subject in subjects]
     columns = min(len(names), PER_ROW)
     lines = -(-len(names) // columns)
-    with mpl.rc_context(STYLE):
-        width = max(8.6, 1.75 * columns)
-        heights = [width / columns * lines * 0.95, 3.6]
-        fig = Figure(figsize=(width, 0.7 + sum(heights)), dpi=DPI, layout="constrained")
-        layout = fig.add_gridspec(2, 1, height_ratios=heights)
-        above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
-        cells = above.subplots(lines, columns, squeeze=False).ravel()
-        for ax, subject in zip(cells, subjects, strict=False):
-            draw_view(ax, subject, rows.loc[rows["object"].eq(subject.name)], stand_in)
-        for ax in cells[len(names) :]:
-            ax.axis("off")
-        draw_errors(below.subplots(), rows, names, paper)
-        handles = [
-            Patch(color=MASK_COLOR, label="mask of the camera"),
-            Patch(color=HULL_COLOR, label="added by its convex hull"),
-            Line2D([], [], color=OBJECT_EDGE, linewidth=1, label="true outline"),
-            Line2D([], [], color=TOOL_COLOR, linewidth=2.4, marker="^", label="contact shown"),
-            Line2D([], [], color=INK, marker="o", linestyle="none", markersize=4, label="other contacts"),
-        ]
-        above.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
-        shown: list[Patch | Line2D] = [
-            Patch(facecolor=color, alpha=0.45, edgecolor=color, label=f"stand-in against {name}")
-            for name, (_, color) in BARS.items()
-        ]
-        if paper:
-            shown.append(Line2D([], [], label="paper: real against predicted", **PAPER_MARK))
-        note = "bars: mean and standard deviation; dots: single lever-ups"
-        below.legend(
-            handles=shown, loc="outside lower center", ncols=3, fontsize=8.5, title=note, title_fontsize=8.5
-        )
-        title = "Objects as the predictor observes them, and the distance of its path from the stand-in's"
-        finish(
-            fig,
-            title,
-            "A simulated stand-in for the real robot: Bullet, other friction, errors of contact and camera",
-        )
+    width = max(8.6, 1.75 * columns)
+    heights = [width / columns * lines * 0.95, 3.6]
+    fig = new_figure(width, 0.7 + sum(heights))
+    layout = fig.add_gridspec(2, 1, height_ratios=heights)
+    above, below = fig.add_subfigure(layout[0]), fig.add_subfigure(layout[1])
+    cells = above.subplots(lines, columns, squeeze=False).ravel()
+    for ax, subject in zip(cells, subjects, strict=False):
+        draw_view(ax, subject, rows.loc[rows["object"].eq(subject.name)], stand_in)
+    for ax in cells[len(names) :]:
+        ax.axis("off")
+    draw_errors(below.subplots(), rows, names, paper)
+    handles = [
+        Patch(color=MASK_COLOR, label="mask of the camera"),
+        Patch(color=HULL_COLOR, label="added by its convex hull"),
+        Line2D([], [], color=OBJECT_EDGE, linewidth=1, label="true outline"),
+        Line2D([], [], color=TOOL_COLOR, linewidth=2.4, marker="^", label="contact shown"),
+        Line2D([], [], color=INK, marker="o", linestyle="none", markersize=4, label="other contacts"),
+    ]
+    above.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    shown: list[Patch | Line2D] = [
+        Patch(facecolor=color, alpha=0.45, edgecolor=color, label=f"stand-in against {name}")
+        for name, (_, color) in BARS.items()
+    ]
+    if paper:
+        shown.append(Line2D([], [], label="paper: real against predicted", **PAPER_MARK))
+    note = "bars: mean and standard deviation; dots: single lever-ups"
+    below.legend(
+        handles=shown, loc="outside lower center", ncols=3, fontsize=8.5, title=note, title_fontsize=8.5
+    )
+    title = "Objects as the predictor observes them, and the distance of its path from the stand-in's"
+    finish(
+        fig,
+        title,
+        "A simulated stand-in for the real robot: Bullet, other friction, errors of contact and camera",
+    )
     return fig
 
 
@@ -123,8 +107,7 @@ def draw_view(ax: Axes, subject: Subject, rows: pd.DataFrame, stand_in: StandIn)
     if len(contacts):
         others = (contacts @ T[:2, :2].T + T[:2, 3]) * CM
         ax.plot(others[:, 1], others[:, 0], "o", color=INK, markersize=4)
-    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 2.4, "shrinkA": 0, "shrinkB": 0}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+    draw_arrow(ax, 2.4)
     low, high = np.minimum(outline.min(axis=0) * CM, [-5, 0]), outline.max(axis=0) * CM
     middle, half = (low + high) / 2, max((high - low).max() / 2, 9) + 1.5
     ax.set(
@@ -174,75 +157,60 @@ def draw_errors(ax: Axes, rows: pd.DataFrame, names: Sequence[str], paper: Mappi
             label.set_verticalalignment("top")
 
 
+@styled
 def paths_figure(
     rows: pd.DataFrame,
     observed: str = "stand-in",
     note: str = "The stand-in is Bullet with other constants and errors, not a robot; the table is grey",
 ) -> Figure:
-    """Paths of the centre of mass from the side: observed, predicted, simulated (paper, figure 14, last panel).
-
-    Args:
-        rows: Lever-ups that have paths; four are shown in a row.
-        observed: What the observed path is called.
-        note: What stands under the title.
-    """
+    """Paths of the centre of mass from the side: observed, predicted, simulated (paper, figure 14, last panel)."""
     columns = min(len(rows), PATHS_PER_ROW)
     lines = -(-len(rows) // columns)
-    with mpl.rc_context(STYLE):
-        width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
-        fig = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-        cells = fig.subplots(lines, columns, squeeze=False).ravel()
-        for ax, row in zip(cells, rows.to_dict("records"), strict=False):
-            paths = {name: np.array(path) / CM for name, path in json.loads(row["paths_cm"]).items()}
-            slip = row.get("slip_time", np.nan)
-            slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
-            draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
-        for ax in cells[len(rows) :]:
-            ax.axis("off")
-        handles = [
-            Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
-            for name, (color, style, width) in zip(
-                (observed, "predicted", "simulated"), PATHS.values(), strict=True
-            )
-        ]
-        fig.legend(handles=handles, loc="outside lower center", ncols=3)
-        finish(fig, "Paths of the centre of mass from the side", note)
+    width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
+    fig = new_figure(width, height)
+    cells = fig.subplots(lines, columns, squeeze=False).ravel()
+    for ax, row in zip(cells, rows.to_dict("records"), strict=False):
+        paths = {name: np.array(path) / CM for name, path in json.loads(row["paths_cm"]).items()}
+        slip = row.get("slip_time", np.nan)
+        slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
+        draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
+    for ax in cells[len(rows) :]:
+        ax.axis("off")
+    handles = _handles((observed, "predicted", "simulated"))
+    fig.legend(handles=handles, loc="outside lower center", ncols=3)
+    finish(fig, "Paths of the centre of mass from the side", note)
     return fig
 
 
+def _handles(names: Sequence[str]) -> list[Line2D]:
+    return [
+        Line2D([], [], color=color, linestyle=style, linewidth=width, label=name)
+        for name, (color, style, width) in zip(names, PATHS.values(), strict=False)
+    ]
+
+
+@styled
 def side_figure(
     observed: Float[np.ndarray, "time 3"], predicted: Float[np.ndarray, "later 3"], title: str
 ) -> Figure:
-    """Observed and predicted path of one recording from the side (paper, figure 14, last panel).
-
-    Args:
-        observed: Centre of mass in the action frame [m].
-        predicted: The same as predicted.
-        title: What the recording is called.
-    """
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(6.4, 6.4), dpi=DPI, layout="constrained")
-        ax = fig.subplots()
-        draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
-        ax.legend(loc="upper left")
-        finish(fig, "Paths of the centre of mass from the side", "The table is grey")
+    """Observed and predicted centre of mass [m] of one recording from the side (paper, figure 14, last panel)."""
+    fig = new_figure(6.4, 6.4)
+    ax = fig.subplots()
+    draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
+    ax.legend(handles=_handles(("observed", "predicted")), loc="upper left")
+    finish(fig, "Paths of the centre of mass from the side", "The table is grey")
     return fig
 
 
 def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: str) -> None:
     """Paths [m] by what they are, in the x-z plane of the action frame; scales in cm."""
     for name, path in paths.items():
-        color, style, width = PATHS[name]
-        x, z = path[:, 0] * CM, path[:, 2] * CM
-        ax.plot(x, z, color=color, linestyle=style, linewidth=width, zorder=5, label=name)
-        ax.plot(x[-1:], z[-1:], "o", color=color, markersize=4.5, zorder=6)
+        draw_path(ax, path[:, [0, 2]] * CM, *PATHS[name])
     ax.set_title(title)
     seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
     (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
     middle = (left + right) / 2
     ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
     ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
-    ax.axhspan(-1, 0, color="#f1f2f4", zorder=-1)
-    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
-    ax.grid(color=GRID, linewidth=0.6)
-    ax.set_axisbelow(True)
+    draw_table(ax, 1)
+    mesh(ax)

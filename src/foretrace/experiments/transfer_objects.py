@@ -134,13 +134,9 @@ def play(subject: Subject, contact: int, stand_in: StandIn, repeats: int, seed: 
 def read_silhouettes(
     folder: Path, size: float = GIVEN_SIZE, scale: float | None = None, height: float = GIVEN_HEIGHT
 ) -> list[Subject]:
-    """Objects from a folder of pictures, one silhouette each, white on black.
+    """Objects from a folder of pictures, one silhouette each, white on black; sizes in metres.
 
-    Args:
-        folder: The folder; every picture in it is read.
-        size: Longer side of each silhouette's bounding box [m].
-        scale: Size of a pixel in all of them instead [m].
-        height: Thickness of all of them [m].
+    ``size`` is the longer side of a silhouette's bounding box; ``scale``, of a pixel, takes its place.
 
     Raises:
         ShapeError: The folder is missing or has no picture, or one of them does not show one whole object.
@@ -167,11 +163,7 @@ def read_silhouettes(
 
 
 def read_prisms(file: Path, height: float = GIVEN_HEIGHT) -> list[Subject]:
-    """Objects from a JSON file: by name, ``corners_m`` and, if it is known, ``mass_kg`` and ``height_m``.
-
-    Args:
-        file: The file.
-        height: Thickness of those that do not tell it [m].
+    """Objects from a JSON file: by name, ``corners_m`` and, if they are known, ``mass_kg`` and ``height_m``.
 
     Raises:
         ShapeError: The file is missing or not such a file, or an outline is not usable.

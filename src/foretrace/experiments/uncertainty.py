@@ -74,10 +74,7 @@ ERRORS = {
     "rotation": "Rotation, median [°]",
     "final_rotation": "Final rotation, median [°]",
 }
-WORDS = {**SPLIT_WORDS, **BEGINNING_WORDS}
 DIGITS = 4
-
-Numbers = Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -168,15 +165,14 @@ class Uncertainty(Experiment):
             mine = shown.loc[shown["split"].eq(split)]
             values: dict[str, Any] = {}
             ratio = test_to_train(mine)
-            for (metric, group, level), part in mine.groupby(
-                ["metric", "group", "level"], dropna=False, sort=False
-            ):
+            places = mine.groupby(["metric", "group", "level"], dropna=False, sort=False)
+            for (metric, group, level), part in places:
                 numbers = _numbers(part.sort_values("seed")["value"].to_numpy(float), ratio)
-                found = values.setdefault(metric, {})
-                if np.isnan(level):
-                    found[group] = numbers
+                place = values.setdefault(metric, {})
+                if np.isfinite(level):
+                    place.setdefault(group, {})[f"{level:g}"] = numbers
                 else:
-                    found.setdefault(group, {})[f"{level:g}"] = numbers
+                    place[group] = numbers
             counts = mine.loc[mine["metric"].str.startswith("count_")]
             few = sorted(set(counts.loc[counts["value"].lt(FEW), "group"]))
             summary[split] = {"seeds": sorted(map(int, set(mine["seed"]))), "few": few, "values": values}
@@ -188,7 +184,7 @@ class Uncertainty(Experiment):
         for split, found in summary.items():
             values = found["values"]
             seeds = ", ".join(map(str, found["seeds"]))
-            parts += [f"## {WORDS.get(split, split)}, seeds {seeds}", *_examples(values, found["few"])]
+            parts += [f"## {SPLIT_WORDS.get(split, split)}, seeds {seeds}", *_examples(values, found["few"])]
             parts += ["### Outcomes", *_outcomes(values)]
             parts += ["### Errors of the most probable and of the nearest future", _errors(values)]
             parts += ["### Regions", *_regions(values)]
@@ -226,11 +222,7 @@ class Uncertainty(Experiment):
 
 
 def load(data: str | Path, like: InteractionBatch | None = None) -> InteractionBatch:
-    """All interactions that have a motion to learn from, whatever their outcome.
-
-    Args:
-        data: Folder of the data set.
-        like: Others that have to be sampled at the same times.
+    """All interactions that have a motion to learn from, sampled at the same times as the other ones, if any.
 
     Raises:
         DatasetError: There is no data set, none of its interactions has two samples, or they are sampled otherwise.
@@ -303,12 +295,8 @@ def measure(
 
 def test_to_train(rows: pd.DataFrame) -> float:
     """Size of the test part divided by that of the training part."""
-    sizes = rows.loc[rows["metric"].isin(["count_test", "count_train"])].groupby("metric")["value"].sum()
-    return (
-        float(sizes.get("count_test", np.nan) / sizes.get("count_train", np.nan))
-        if len(sizes) == 2
-        else TEST_TO_TRAIN
-    )
+    test, train = (rows.loc[rows["metric"].eq(f"count_{part}"), "value"].sum() for part in ("test", "train"))
+    return float(test / train) if test and train else TEST_TO_TRAIN
 
 
 def _numbers(values: np.ndarray, ratio: float) -> dict[str, float | None]:
@@ -318,37 +306,32 @@ def _numbers(values: np.ndarray, ratio: float) -> dict[str, float | None]:
 
 
 def _examples(values: Mapping[str, Any], few: Sequence[str]) -> list[str]:
-    outcomes = list(values["count_test"])
-    lines = [["Outcome", *PARTS]]
-    for name in outcomes:
-        lines.append([f"`{name}`", *(f"{values[f'count_{part}'][name]['mean']:.4g}" for part in PARTS)])
-    notes = []
-    if few:
-        named = ", ".join(f"`{name}`" for name in few)
-        notes = [f"Too few examples (fewer than {FEW} in some part of some split) of: {named}."]
-    return ["Interactions in each part:", markdown_table(lines[0], lines[1:]), *notes]
+    lines = [
+        [_name(outcome), *(f"{values[f'count_{part}'][outcome]['mean']:.4g}" for part in PARTS)]
+        for outcome in values["count_test"]
+    ]
+    named = ", ".join(map(_name, few))
+    notes = [f"Too few examples (fewer than {FEW} in some part of some split) of: {named}."] if few else []
+    return ["Interactions in each part:", markdown_table(["Outcome", *PARTS], lines), *notes]
 
 
 def _outcomes(values: Mapping[str, Any]) -> list[str]:
-    macro, brier = _cell(values["macro_f1"][ALL], 3), _cell(values["brier"][ALL], 3)
-    right, common = (_cell(values[name][ALL], 3) for name in ("accuracy", "accuracy_of_most_common"))
+    macro, right, common, brier = (
+        _cell(values[name][ALL]) for name in ("macro_f1", "accuracy", "accuracy_of_most_common", "brier")
+    )
     text = (
         f"Macro-F1 {macro}; accuracy {right} ({common} for naming the most common one); Brier score {brier}."
     )
-    names = list(values["count_test"])
-    lines = [["Happened", *(f"predicted `{name}`" for name in names), "F1"]]
+    names, lines = list(values["count_test"]), []
     for name in names:
-        counts = (values["confusion"][f"{name}, predicted {other}"]["mean"] for other in names)
-        f1 = _cell(values["f1"].get(name), 3)
-        lines.append([f"`{name}`", *(f"{count:.4g}" for count in counts), f1])
-    return [text, markdown_table(lines[0], lines[1:])]
+        counts = (f"{values['confusion'][f'{name}, predicted {other}']['mean']:.4g}" for other in names)
+        lines.append([_name(name), *counts, _cell(values["f1"].get(name))])
+    return [text, markdown_table(["Happened", *(f"predicted `{name}`" for name in names), "F1"], lines)]
 
 
 def _errors(values: Mapping[str, Any]) -> str:
-    lines = [["", *ERRORS.values()]]
-    for group in values["full"]:
-        lines.append([_name(group), *(_cell(values[metric][group], 3) for metric in ERRORS)])
-    return markdown_table(lines[0], lines[1:])
+    lines = [[_name(group), *(_cell(values[m][group]) for m in ERRORS)] for group in values["full"]]
+    return markdown_table(["", *ERRORS.values()], lines)
 
 
 def _regions(values: Mapping[str, Any]) -> list[str]:
@@ -357,37 +340,36 @@ def _regions(values: Mapping[str, Any]) -> list[str]:
         ("coverage", "Share of motions that stay within a tube all the time:", 3),
         ("tube", "Median radius of the most probable future's tube [cm]:", 2),
     ):
-        lines = [["", *(f"{level:.0%}" for level in SHOWN_LEVELS)]]
-        for group, by_level in values[metric].items():
-            cells = (_cell(by_level[f"{level:g}"], digits) for level in SHOWN_LEVELS)
-            lines.append([_name(group), *cells])
-        found += [words, markdown_table(lines[0], lines[1:])]
+        lines = [
+            [_name(group), *(_cell(by_level[f"{level:g}"], digits) for level in SHOWN_LEVELS)]
+            for group, by_level in values[metric].items()
+        ]
+        found += [words, markdown_table(["", *(f"{level:.0%}" for level in SHOWN_LEVELS)], lines)]
     return found
 
 
 def _scores(values: Mapping[str, Any]) -> str:
-    lines = [["Samples of", "", *SCORES.values()]]
-    for forecast, words in FORECASTS.items():
-        for group in values[f"{forecast}_crps"]:
-            cells = (_cell(values[f"{forecast}_{name}"][group], 3) for name in SCORES)
-            lines.append([words, _name(group), *cells])
-    return markdown_table(lines[0], lines[1:])
+    lines = [
+        [words, _name(group), *(_cell(values[f"{forecast}_{name}"][group]) for name in SCORES)]
+        for forecast, words in FORECASTS.items()
+        for group in values[f"{forecast}_crps"]
+    ]
+    return markdown_table(["Samples of", "", *SCORES.values()], lines)
 
 
 def _observed(values: Mapping[str, Any], prefix: str = "") -> list[str]:
     found = []
     for name in BEGINNINGS:
-        beginning = prefix + name
-        levels = [f"{k}" for k in OBSERVED if f"{k}" in values[f"{beginning}_rest"].get(ALL, {})]
-        lines = [["Observed samples", *levels]]
-        for group in values[f"{beginning}_rest"]:
-            for metric, words in (("rest", "error [cm]"), ("rest_ratio", "÷ unobserved")):
-                by_level = values[f"{beginning}_{metric}"][group]
-                cells = (_cell(by_level.get(level), 3) for level in levels)
-                lines.append([f"{_name(group)}, {words}", *cells])
-        scores = values[f"{beginning}_macro_f1"][ALL]
-        lines.append(["Macro-F1 of outcomes", *(_cell(scores.get(level), 3) for level in levels)])
-        found += [f"Samples counted {WORDS[name]}:", markdown_table(lines[0], lines[1:])]
+        rest, ratio, f1 = (values[f"{prefix}{name}_{m}"] for m in ("rest", "rest_ratio", "macro_f1"))
+        levels = [f"{k}" for k in OBSERVED if f"{k}" in rest.get(ALL, {})]
+        rows = {}
+        for group in rest:
+            rows[f"{_name(group)}, error [cm]"] = rest[group]
+            rows[f"{_name(group)}, ÷ unobserved"] = ratio[group]
+        rows["Macro-F1 of outcomes"] = f1[ALL]
+        lines = [[words, *(_cell(by_level.get(k)) for k in levels)] for words, by_level in rows.items()]
+        table = markdown_table(["Observed samples", *levels], lines)
+        found += [f"Samples counted {BEGINNING_WORDS[name]}:", table]
     return found
 
 
@@ -395,5 +377,5 @@ def _name(group: str) -> str:
     return "All" if group == ALL else f"`{group}`"
 
 
-def _cell(numbers: Numbers | None, digits: int) -> str:
+def _cell(numbers: Mapping[str, float | None] | None, digits: int = 3) -> str:
     return mean_with_interval(numbers, digits, missing="-")

@@ -117,10 +117,6 @@ def futures_of(imagined: ImaginedBatch) -> Futures:
 def evaluate_outcomes(predicted: Mapping[str, Float[np.ndarray, " batch"]], truth: np.ndarray) -> Found:
     """Whether the most probable outcome is what happened.
 
-    Args:
-        predicted: Probability of each outcome.
-        truth: (batch,) names of what happened.
-
     Returns:
         ``confusion``: how often of two outcomes the first happened and the second was most probable. ``f1`` of each
         outcome that happened or was predicted, and their mean ``macro_f1``. ``accuracy``, and that of always predicting

@@ -1,6 +1,5 @@
 """Many interactions from above on one sheet."""
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -9,21 +8,22 @@ from matplotlib.lines import Line2D
 from foretrace.errors import DatasetError
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction, Outcome
-from foretrace.pictures.scene import ARROW_LENGTH, support_handle
+from foretrace.pictures.scene import draw_arrow, support_handle
 from foretrace.pictures.style import (
     CM,
-    DPI,
     GREY,
     INK,
     OBJECT_COLOR,
     OBJECT_EDGE,
     OUTCOME_COLORS,
-    STYLE,
     SUPPORT_COLOR,
-    TOOL_COLOR,
+    headline,
+    new_figure,
+    styled,
 )
 
 
+@styled
 def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
     """Many interactions from above at one scale: outline, action, support points and path by outcome.
 
@@ -41,18 +41,17 @@ def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
     columns = min(columns, len(shown))
     rows = -(-len(shown) // columns)
     counts = dataset.outcomes()
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(1.55 * columns + 0.3, 1.7 * rows + 1.0), dpi=DPI, layout="constrained")
-        for cell, k in enumerate(shown):
-            _draw_cell(fig.add_subplot(rows, columns, cell + 1), dataset[int(k)])
-        title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
-        fig.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        handles = [
-            Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
-            for name, count in counts.items()
-        ]
-        handles.append(support_handle())
-        fig.legend(handles=handles, loc="outside lower center", ncols=8)
+    fig = new_figure(1.55 * columns + 0.3, 1.7 * rows + 1.0)
+    for cell, k in enumerate(shown):
+        _draw_cell(fig.add_subplot(rows, columns, cell + 1), dataset[int(k)])
+    title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
+    headline(fig, title)
+    handles = [
+        Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
+        for name, count in counts.items()
+    ]
+    handles.append(support_handle())
+    fig.legend(handles=handles, loc="outside lower center", ncols=8)
     return fig
 
 
@@ -63,8 +62,7 @@ def _draw_cell(ax: Axes, interaction: Interaction) -> None:
     placement = interaction.action.T_action_object
     outline = (interaction.object.corners @ placement[:2, :2].T + placement[:2, 3]) * CM
     ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=0.9)
-    arrow = {"arrowstyle": "-|>", "color": TOOL_COLOR, "linewidth": 1.5, "shrinkA": 0, "shrinkB": 0}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+    draw_arrow(ax, 1.5)
     points = effect.support_points * CM
     ax.plot(points[:, 1], points[:, 0], color=SUPPORT_COLOR, linewidth=1.5, marker="o", markersize=3)
     path = effect.com_trajectory * CM

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -13,16 +12,13 @@ from matplotlib.ticker import MultipleLocator
 from foretrace.errors import DatasetError
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
-from foretrace.pictures.scene import ARROW_LENGTH, silhouette, tool_line
+from foretrace.pictures.scene import ARROW_LENGTH, draw_arrow, draw_instant, draw_table, silhouette
 from foretrace.pictures.style import (
     CM,
-    DPI,
-    GREY,
-    OBJECT_COLOR,
-    OBJECT_EDGE,
     OUTCOME_COLORS,
-    STYLE,
-    TOOL_COLOR,
+    headline,
+    new_figure,
+    styled,
 )
 
 MARGIN = 0.02
@@ -35,6 +31,7 @@ MASK_COLORS = ListedColormap(["white", "#4a6078"])
 HEIGHT_COLORS = "cividis"
 
 
+@styled
 def non_flat_figure(interactions: Mapping[str, Interaction]) -> Figure:
     """Lever-ups of objects that look alike from above: mask, height map and motion of each, in one row.
 
@@ -54,22 +51,21 @@ def non_flat_figure(interactions: Mapping[str, Interaction]) -> Figure:
     window, highest = _window(views), max(float(view.height.max()) for view in views)
     span = _side_span([interaction for _, interaction in shown])
     width = (span[1] - span[0]) / (span[3] - span[2])
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(12.6, 0.9 + 2.35 * len(shown)), dpi=DPI, layout="constrained")
-        axes = fig.subplots(len(shown), 3, squeeze=False, width_ratios=[1.0, 1.0, 1.15 * width])
-        images = []
-        for (mask, height, side), (name, interaction) in zip(axes, shown, strict=True):
-            view = interaction.view
-            _draw_map(mask, view, window, view.mask, 1.0, MASK_COLORS)
-            images.append(_draw_map(height, view, window, view.height * CM, highest * CM, HEIGHT_COLORS))
-            _draw_motion(side, interaction, span)
-            mask.set_title(f"{name[:1].upper()}{name[1:]}: mask")
-            mask.set_ylabel("x, along the action [cm]")
-            height.set_title("Height map")
-        for ax in axes[:-1].ravel():
-            ax.set_xlabel("")
-        fig.colorbar(images[0], ax=axes[:, 1], label="height [cm]", shrink=0.7, aspect=28)
-        fig.suptitle(_headline(views), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    fig = new_figure(12.6, 0.9 + 2.35 * len(shown))
+    axes = fig.subplots(len(shown), 3, squeeze=False, width_ratios=[1.0, 1.0, 1.15 * width])
+    images = []
+    for (mask, height, side), (name, interaction) in zip(axes, shown, strict=True):
+        view = interaction.view
+        _draw_map(mask, view, window, view.mask, 1.0, MASK_COLORS)
+        images.append(_draw_map(height, view, window, view.height * CM, highest * CM, HEIGHT_COLORS))
+        _draw_motion(side, interaction, span)
+        mask.set_title(f"{name[:1].upper()}{name[1:]}: mask")
+        mask.set_ylabel("x, along the action [cm]")
+        height.set_title("Height map")
+    for ax in axes[:-1].ravel():
+        ax.set_xlabel("")
+    fig.colorbar(images[0], ax=axes[:, 1], label="height [cm]", shrink=0.7, aspect=28)
+    headline(fig, _headline(views))
     return fig
 
 
@@ -106,8 +102,7 @@ def _draw_map(
         vmax=highest,
         interpolation="nearest",
     )
-    arrow = {"arrowstyle": "-|>,head_width=0.3,head_length=0.6", "color": TOOL_COLOR, "linewidth": 2.2}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops={**arrow, "shrinkA": 0, "shrinkB": 0})
+    draw_arrow(ax, 2.2, 0.3)
     x0, x1, y0, y1 = (CM * value for value in window)
     ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, to the left [cm]")
     for axis in (ax.xaxis, ax.yaxis):
@@ -130,7 +125,7 @@ def _side_span(interactions: list[Interaction]) -> tuple[float, float, float, fl
 
 def _draw_motion(ax: Axes, interaction: Interaction, span: tuple[float, float, float, float]) -> None:
     """Silhouettes from light to dark with their times, the blade, and the path of the centre of mass."""
-    effect, obj = interaction.effect, interaction.object
+    effect = interaction.effect
     color = OUTCOME_COLORS[effect.outcome]
     moved = np.flatnonzero(np.linalg.norm(effect.com_trajectory - effect.com_trajectory[0], axis=1) > 1e-3)
     first = int(moved[0]) if len(moved) else 0
@@ -139,15 +134,11 @@ def _draw_motion(ax: Axes, interaction: Interaction, span: tuple[float, float, f
     steps = np.linspace(0, travelled[-1], INSTANTS) if len(travelled) else np.zeros(1)
     chosen = np.unique(first + np.searchsorted(travelled, steps[:-1]))
     chosen = np.append(chosen, len(effect.times) - 1)
-    ax.axhspan(100 * span[2] * CM, 0, color="#f1f2f4", zorder=-1)
-    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
+    draw_table(ax, -100 * span[2] * CM)
     for strength, k in zip(np.linspace(0.25, 1.0, len(chosen)), chosen, strict=True):
-        for ring in silhouette(obj, effect.pose_trajectory[k]):
-            ax.fill(*ring.T * CM, facecolor=OBJECT_COLOR, alpha=0.35, linewidth=0)
-            ax.plot(*ring.T * CM, color=OBJECT_EDGE, alpha=strength, linewidth=1.2)
-        if effect.tool_trajectory[k, 2] < BLADE_SHOWN * span[3]:
-            blade = tool_line(effect.tool_trajectory[k])[:, [0, 2]] * CM
-            ax.plot(*blade.T, color=TOOL_COLOR, alpha=strength, linewidth=2.0)
+        tool = effect.tool_trajectory[k]
+        shown = tool if tool[2] < BLADE_SHOWN * span[3] else None
+        draw_instant(ax, interaction.object, effect.pose_trajectory[k], shown, strength, 2.0)
     path = effect.com_trajectory * CM
     ax.plot(path[:, 0], path[:, 2], color=color, linewidth=2.2, zorder=4)
     ax.plot(path[chosen, 0], path[chosen, 2], color=color, marker="o", markersize=3.5, linestyle="", zorder=5)

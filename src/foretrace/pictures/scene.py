@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 import shapely
 from jaxtyping import Float
@@ -24,17 +23,18 @@ from foretrace.objects import ObjectModel
 from foretrace.pictures.bands import PredictionBand
 from foretrace.pictures.style import (
     CM,
-    DPI,
     GREY,
     INK,
     OBJECT_COLOR,
     OBJECT_EDGE,
     PREDICTION_COLORS,
     PREDICTION_LINES,
-    STYLE,
     SUPPORT_COLOR,
     TOOL_COLOR,
     TRUTH_COLOR,
+    headline,
+    new_figure,
+    styled,
 )
 
 TOOL_REACH = 0.12
@@ -172,18 +172,18 @@ def interaction_figure(
     return scene_figure(Scene.observed(interaction, predictions))
 
 
+@styled
 def scene_figure(scene: Scene) -> Figure:
     """The picture of `interaction_figure` for any scene."""
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(13.2, 4.9), dpi=DPI, layout="constrained")
-        grid = fig.add_gridspec(3, 3, width_ratios=[1.0, 1.28, 1.05])
-        draw_from_above(fig.add_subplot(grid[:, 0]), scene)
-        draw_from_the_side(fig.add_subplot(grid[:, 1]), scene)
-        first = fig.add_subplot(grid[0, 2])
-        axes = [first, *(fig.add_subplot(grid[k, 2], sharex=first) for k in (1, 2))]
-        draw_over_time(axes, scene)
-        fig.suptitle(scene.title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        fig.legend(handles=legend_of(scene), loc="outside lower center", ncols=2, fontsize=9)
+    fig = new_figure(13.2, 4.9)
+    grid = fig.add_gridspec(3, 3, width_ratios=[1.0, 1.28, 1.05])
+    draw_from_above(fig.add_subplot(grid[:, 0]), scene)
+    draw_from_the_side(fig.add_subplot(grid[:, 1]), scene)
+    first = fig.add_subplot(grid[0, 2])
+    axes = [first, *(fig.add_subplot(grid[k, 2], sharex=first) for k in (1, 2))]
+    draw_over_time(axes, scene)
+    headline(fig, scene.title)
+    fig.legend(handles=legend_of(scene), loc="outside lower center", ncols=2, fontsize=9)
     return fig
 
 
@@ -207,18 +207,51 @@ def support_handle() -> Line2D:
     return Line2D([], [], color=SUPPORT_COLOR, marker="o", markersize=5, label="support points")
 
 
+def draw_arrow(ax: Axes, width: float, head: float = 0.2) -> None:
+    """The action from above: an arrow upwards that ends at the contact."""
+    style = f"-|>,head_width={head},head_length={2 * head}"
+    arrow = {"arrowstyle": style, "color": TOOL_COLOR, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops=arrow)
+
+
+def draw_path(ax: Axes, path: Float[np.ndarray, "time 2"], color: str, style: Any, width: float) -> None:
+    """A path [cm] and a dot at its end."""
+    ax.plot(*path.T, color=color, linestyle=style, linewidth=width, zorder=4)
+    ax.plot(*path[-1:].T, "o", color=color, markersize=4.5, zorder=5)
+
+
+def draw_table(ax: Axes, depth: float) -> None:
+    """The table from the side, down to a depth [cm]."""
+    ax.axhspan(-depth, 0, color="#f1f2f4", zorder=-1)
+    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
+
+
+def draw_instant(
+    ax: Axes,
+    obj: ObjectModel,
+    pose: Float[np.ndarray, "7"],
+    tool: Float[np.ndarray, "7"] | None,
+    strength: float,
+    width: float = 2.4,
+) -> None:
+    """Object and blade from the side at one moment."""
+    for ring in silhouette(obj, pose):
+        ax.fill(*ring.T * CM, facecolor=OBJECT_COLOR, alpha=0.35, linewidth=0)
+        ax.plot(*ring.T * CM, color=OBJECT_EDGE, alpha=strength, linewidth=1.2)
+    if tool is not None:
+        ax.plot(*tool_line(tool)[:, [0, 2]].T * CM, color=TOOL_COLOR, alpha=strength, linewidth=width)
+
+
 def draw_from_above(ax: Axes, scene: Scene, margin: float = 0.025) -> None:
     """The object at rest, the action's arrow, support points and paths; the action points up."""
     outline = scene.outline * CM
     ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=1.4)
-    arrow = {"arrowstyle": "-|>,head_width=0.35,head_length=0.7", "color": TOOL_COLOR, "linewidth": 2.6}
-    ax.annotate("", (0, 0), (0, -ARROW_LENGTH * CM), arrowprops={**arrow, "shrinkA": 0, "shrinkB": 0})
+    draw_arrow(ax, 2.6, 0.35)
     if scene.support_points is not None:
         points = scene.support_points * CM
         ax.plot(points[:, 1], points[:, 0], color=SUPPORT_COLOR, linewidth=2, marker="o", zorder=3)
     for _, path, color, style, width in scene.paths():
-        ax.plot(path[:, 1] * CM, path[:, 0] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
-        ax.plot(path[-1, 1] * CM, path[-1, 0] * CM, color=color, marker="o", markersize=4.5, zorder=5)
+        draw_path(ax, path[:, [1, 0]] * CM, color, style, width)
     paths = [path[:, :2] for _, path, *_ in scene.paths()]
     paths.append(scene.band.draw_in_plane(ax, [1, 0], PREDICTION_COLORS[0])[:, ::-1])
     seen = np.concatenate([scene.outline, [[-ARROW_LENGTH, 0]], *paths])
@@ -234,19 +267,12 @@ def draw_from_the_side(ax: Axes, scene: Scene, instants: int = 5) -> None:
     last = len(scene.pose) - 1
     chosen = np.unique(np.linspace(first, last, instants).round().astype(int))
     for strength, k in zip(np.linspace(0.25, 1.0, len(chosen)), chosen, strict=True):
-        for ring in silhouette(scene.obj, scene.pose[k]):
-            ax.fill(*ring.T * CM, facecolor=OBJECT_COLOR, alpha=0.35, linewidth=0)
-            ax.plot(*ring.T * CM, color=OBJECT_EDGE, alpha=strength, linewidth=1.2)
-        if scene.tool is not None:
-            line = tool_line(scene.tool[k])[:, [0, 2]] * CM
-            ax.plot(*line.T, color=TOOL_COLOR, alpha=strength, linewidth=2.4)
+        draw_instant(ax, scene.obj, scene.pose[k], None if scene.tool is None else scene.tool[k], strength)
     for _, path, color, style, width in scene.paths():
-        ax.plot(path[:, 0] * CM, path[:, 2] * CM, color=color, linestyle=style, linewidth=width, zorder=4)
-        ax.plot(path[-1, 0] * CM, path[-1, 2] * CM, color=color, marker="o", markersize=4.5, zorder=5)
+        draw_path(ax, path[:, [0, 2]] * CM, color, style, width)
     scene.band.draw_in_plane(ax, [0, 2], PREDICTION_COLORS[0])
     (left, right), top = ax.get_xlim(), max(ax.get_ylim()[1], 6.0)
-    ax.axhline(0, color=GREY, linewidth=1.2, zorder=0)
-    ax.axhspan(-50, 0, color="#f1f2f4", zorder=-1)
+    draw_table(ax, 50)
     if scene.tool is not None:
         x, _, z = tool_line(scene.tool[-1])[1] * CM
         ax.text(x, z, "  blade", color=TOOL_COLOR)
@@ -293,29 +319,29 @@ def tool_line(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2 3"]:
     return transform_points(pose_to_matrix(pose), np.array([[0.0, 0, 0], [-TOOL_REACH, 0, 0]]))
 
 
+@styled
 def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
     """Several lever-ups side by side, each from above and from the side, imagined beside observed.
 
     Args:
         scenes: What to show, by the title of its column.
     """
-    with mpl.rc_context(STYLE):
-        fig = Figure(figsize=(3.5 * len(scenes), 7.4), dpi=DPI, layout="constrained")
-        axes = fig.subplots(2, len(scenes), squeeze=False)
-        for column, (title, scene) in enumerate(scenes.items()):
-            draw_from_above(axes[0, column], scene)
-            draw_from_the_side(axes[1, column], scene)
-            errors = [f"{name}: {_errors(scene, path)[0]:.2f} cm" for name, path in scene.predictions.items()]
-            axes[0, column].set_title("\n".join([title, *errors]), fontsize=10)
-            axes[1, column].set_title("")
-            if column > 0:
-                axes[0, column].set_ylabel("")
-                axes[1, column].set_ylabel("")
-        handles = [
-            Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
-            for name, _, color, style, width in next(iter(scenes.values())).paths()
-        ]
-        fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=4)
+    fig = new_figure(3.5 * len(scenes), 7.4)
+    axes = fig.subplots(2, len(scenes), squeeze=False)
+    for column, (title, scene) in enumerate(scenes.items()):
+        draw_from_above(axes[0, column], scene)
+        draw_from_the_side(axes[1, column], scene)
+        errors = [f"{name}: {_errors(scene, path)[0]:.2f} cm" for name, path in scene.predictions.items()]
+        axes[0, column].set_title("\n".join([title, *errors]), fontsize=10)
+        axes[1, column].set_title("")
+        if column > 0:
+            axes[0, column].set_ylabel("")
+            axes[1, column].set_ylabel("")
+    handles = [
+        Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
+        for name, _, color, style, width in next(iter(scenes.values())).paths()
+    ]
+    fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=4)
     return fig
 
 

@@ -5,6 +5,9 @@ The colours are Okabe and Ito's, which colour-blind readers can tell apart; line
 
 from typing import Any
 
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
 from foretrace.interactions.record import Outcome
 
 INK = "#22262e"
@@ -45,3 +48,16 @@ STYLE: dict[Any, Any] = {
 }
 CM = 100.0
 DPI = 150
+
+styled = mpl.rc_context(STYLE)
+"""Decorator of functions that draw in this style."""
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty picture [inches] whose axes make room for labels and legends."""
+    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+
+
+def headline(fig: Figure, title: str) -> None:
+    """Title of a whole picture."""
+    fig.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
