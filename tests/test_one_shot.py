@@ -10,7 +10,8 @@ from factories import fake_batch
 from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import Outline
-from foretrace.features.outline import MAX_CORNERS, UNIT
+from foretrace.features.base import UNIT
+from foretrace.features.hull import MAX_CORNERS
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import FLOOR, LEVELS, Futures, quantiles_of

@@ -12,12 +12,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from foretrace.features.base import UNIT
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.objects import BEVEL
 
-UNIT = 0.1
-"""Lengths are divided by this to be of unit scale [m]."""
 NEAR_CORNER = 0.01
 """Distance from a corner within which the place where the ray leaves the hull is described in more detail [m]."""
 AT_CORNER = 0.003

@@ -46,6 +46,8 @@ SPLIT = "split.json"
 RESUME = "resume.safetensors"
 TENSORBOARD = "tensorboard"
 
+Source = InteractionBatch | Dataset
+"""Interactions in memory or on disk."""
 Row = dict[str, int | float]
 """The metrics of one epoch, by name."""
 
@@ -142,7 +144,7 @@ class RunFolder:
         }
         write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": versions})
 
-    def write_split(self, source: InteractionBatch | Dataset, split: Split) -> None:
+    def write_split(self, source: Source, split: Split) -> None:
         """Note the ids of the interactions in each part, and what they were."""
         parts, ids = asdict(split).items(), source.ids
         content = {part: ids[rows].tolist() for part, rows in parts}
@@ -208,35 +210,34 @@ class RunFolder:
         (self.path / RESUME).unlink(missing_ok=True)
 
 
-Source = InteractionBatch | Dataset
-
-
-def fingerprint(source: InteractionBatch | Dataset, context: Sequence[str] = ()) -> str:
+def fingerprint(source: Source, context: Sequence[str] = ()) -> str:
     """A short hash of everything in interactions that a training can read, and of the context it is conditioned on."""
     return short_hash(_contents(source, context))
 
 
-def _contents(source: InteractionBatch | Dataset, context: Sequence[str]) -> Iterator[bytes]:
+def _contents(source: Source, context: Sequence[str]) -> Iterator[bytes]:
     """The same bytes of a batch and of a data set, which is gone through for each of the large arrays."""
     small: dict[str, list[np.ndarray]] = {}
     yield np.ascontiguousarray(source.ids).tobytes()
-    for name in ("mask", "height", "times", "com", "pose"):
-        if name == "times":
-            yield np.ascontiguousarray(source.times).tobytes()
-            continue
+    for batch in source.batches():
+        yield np.ascontiguousarray(batch.mask).tobytes()
+        for name in ("length", "slip_index", "support_points", "outcome"):
+            small.setdefault(name, []).append(getattr(batch, name))
+        for name in context:
+            small.setdefault(f"context {name}", []).append(column_of(batch, name))
+    for batch in source.batches():
+        yield np.ascontiguousarray(batch.height).tobytes()
+    yield np.ascontiguousarray(source.times).tobytes()
+    for name in ("com", "pose"):
         for batch in source.batches():
             yield np.ascontiguousarray(getattr(batch, name)).tobytes()
-            if name == "mask":
-                for column in ("length", "slip_index", "support_points", "outcome"):
-                    small.setdefault(column, []).append(getattr(batch, column))
-                for column in context:
-                    small.setdefault(f"context {column}", []).append(column_of(batch, column))
-    joined = {name: np.concatenate(parts) for name, parts in small.items()}
-    for name in ("length", "slip_index", "support_points"):
-        yield np.ascontiguousarray(joined[name]).tobytes()
-    yield "\n".join(joined["outcome"].tolist()).encode()
-    for name in context:
-        yield np.ascontiguousarray(joined[f"context {name}"]).tobytes()
+    for name, parts in small.items():
+        values = np.concatenate(parts)
+        yield (
+            "\n".join(values.tolist()).encode()
+            if name == "outcome"
+            else np.ascontiguousarray(values).tobytes()
+        )
 
 
 def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
@@ -256,7 +257,7 @@ def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
         return {}
 
 
-def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test") -> InteractionBatch:
+def part_of(run: str | Path, data: Source, part: str = "test") -> InteractionBatch:
     """The interactions that were one part of a training's split.
 
     Args:
