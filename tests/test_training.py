@@ -356,9 +356,9 @@ def test_the_best_validation_epoch_is_kept(tmp_path, batch, monkeypatch):
     kept = []
     validate = training_module._Training._validate
 
-    def scripted(self, fixed):
+    def scripted(self):
         kept.append({name: tensor.clone() for name, tensor in self.predictor.state_dict().items()})
-        return validate(self, fixed) | {"validation_loss": next(losses)}
+        return validate(self) | {"validation_loss": next(losses)}
 
     monkeypatch.setattr(training_module._Training, "_validate", scripted)
     tensors = load_file(train(batch, tmp_path / "run") / "model.safetensors")

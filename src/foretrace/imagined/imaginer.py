@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions import Action
 from foretrace.errors import PredictionError
-from foretrace.geometry import Numbers
+from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined.context import (
     PARAMETERS,
     column_of,
@@ -278,10 +278,4 @@ def _check_type(name: str, value: object, kind: type) -> None:
 
 
 def _point(com: Numbers) -> Float[np.ndarray, "3"]:
-    try:
-        point = np.array(com, dtype=float)
-    except (TypeError, ValueError):
-        point = np.full(0, np.nan)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise PredictionError(f"com is {com}: give a finite centre of mass (x, y, z) [m], or none")
-    return point
+    return finite_array("the centre of mass com (x, y, z) [m]", com, (3,), PredictionError)

@@ -1,6 +1,6 @@
 """Parts of the data, ready to learn from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ class Part:
     """(batch,) numbers of the outcomes that the predictor distinguishes."""
     measures: dict[str, np.ndarray]
     """(batch,) measures by which objects are compared."""
-    features: Tensor | None = None
+    features: Tensor | None = field(default=None, init=False)
     """Features and context, once they are computed, of an extractor that is not trained with the predictor."""
 
     def __len__(self) -> int:
