@@ -22,7 +22,6 @@ from foretrace.imagined.context import (
     recorded_context,
 )
 from foretrace.imagined.domain import (
-    OWN,
     check_contacts,
     check_object,
     check_view,
@@ -130,7 +129,7 @@ class Imaginer(ABC):
         """
         self._check_sight()
         _check_type("view", view, TopDownView)
-        check_view(view)
+        check_view(view.mask, view.height)
         parameters = {}
         if action is not None:
             _check_type("action", action, Action)
@@ -170,8 +169,7 @@ class Imaginer(ABC):
             raise PredictionError(f"observed is {observed!r}: give a number of samples from 0 to {most}")
         for id, mask, height in zip(batch.ids, batch.mask, batch.height, strict=True):
             with _naming(f"interaction {id}: "):
-                check_object(mask, height)
-                check_contacts(mask, *OWN)
+                check_view(mask, height)
         values = recorded_context(batch, self.context)
         com = estimate_com(batch)
         if start == "observed":

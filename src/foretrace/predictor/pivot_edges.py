@@ -86,13 +86,6 @@ def find_pivot_edges(
     return PivotEdges(values, torch.stack([axes, axes * axes.new_tensor(MIRROR)[:, None]], dim=1), ends)
 
 
-def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "batch corners 2"]:
-    """The hulls of `find_pivot_edges` seen in a mirror along the action axis, counter-clockwise again."""
-    number, count = torch.arange(corners.shape[1], device=corners.device), _Hull(corners).count[:, None]
-    order = torch.where(number < count, -number % count, 0)
-    return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor(MIRROR[:2])
-
-
 class _Hull:
     """Edges of convex hulls, whose number differs between objects."""
 

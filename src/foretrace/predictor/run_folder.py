@@ -43,6 +43,8 @@ from foretrace.predictor.checkpoint import (
 ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
 SPLIT = "split.json"
+FINGERPRINTS = "fingerprints"
+"""Entry of the split with a fingerprint of each part."""
 RESUME = "resume.safetensors"
 TENSORBOARD = "tensorboard"
 
@@ -149,7 +151,7 @@ class RunFolder:
         parts, ids = asdict(split).items(), source.ids
         content = {part: ids[rows].tolist() for part, rows in parts}
         prints = {part: fingerprint(source[np.sort(rows)]) for part, rows in parts}
-        write_json(self.path / SPLIT, {**content, "fingerprints": prints})
+        write_json(self.path / SPLIT, {**content, FINGERPRINTS: prints})
 
     def save(self, progress: Progress, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
         """Note the end of an epoch; the model itself too if the epoch is the best so far."""
@@ -247,12 +249,10 @@ def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
         run: Folder of the training.
         data: All of the data set.
     """
-    file = Path(run) / SPLIT
-    if not file.is_file():
-        return {}
-    names = [name for name in json.loads(file.read_text(encoding="utf-8")) if name != "fingerprints"]
     try:
-        return {name: _rows_of(run, data, name).ids.tolist() for name in names}
+        return {
+            name: _rows_of(run, data, name).ids.tolist() for name in _read_split(run) if name != FINGERPRINTS
+        }
     except (DatasetError, TrainingError):
         return {}
 
@@ -274,13 +274,10 @@ def part_of(run: str | Path, data: Source, part: str = "test") -> InteractionBat
 
 def _rows_of(run: str | Path, data: Source, part: str) -> Source:
     """The interactions that were one part of a training's split, and are still the same."""
-    file = Path(run) / SPLIT
-    if not file.is_file():
-        raise TrainingError(f"{file} is missing: {run} is not the folder of a training")
-    parts = json.loads(file.read_text(encoding="utf-8"))
-    prints = parts.pop("fingerprints")
-    if part not in parts:
-        raise TrainingError(f"{file} has no part {part!r}; it has: {', '.join(parts)}")
+    parts = _read_split(run)
+    prints = parts.pop(FINGERPRINTS, {})
+    if part not in parts or part not in prints:
+        raise TrainingError(f"{Path(run) / SPLIT} has no part {part!r}; it has: {', '.join(parts)}")
     rows = np.flatnonzero(np.isin(data.ids, parts[part]))
     _ = data.times  # those of the whole from here on, even if the part's longest trajectory is shorter
     if len(rows) != len(parts[part]):
@@ -295,6 +292,10 @@ def _rows_of(run: str | Path, data: Source, part: str) -> Source:
             "give the data set that it was trained on"
         )
     return found
+
+
+def _read_split(run: str | Path) -> dict[str, Any]:
+    return read_json(Path(run) / SPLIT, TrainingError, "give the folder of a training")
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
