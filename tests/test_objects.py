@@ -310,13 +310,6 @@ def test_a_family_of_ones_own_registers_itself_and_is_recorded():
     class Tile(Prism):
         kind = "tile"
 
-        @classmethod
-        def from_dict(cls, values):
-            return cls(values["corners"], values["height"])
-
-        def to_dict(self):
-            return {"kind": self.kind, "corners": self.corners.tolist(), "height": self.height}
-
     try:
         tile = Tile([(0.0, 0.0), (0.1, 0.0), (0.1, 0.1)], 0.02)
         again = object_from_dict(json.loads(json.dumps(tile.to_dict())))

@@ -118,12 +118,12 @@ def poses(number: int, **changes: float) -> np.ndarray:
     ("times", "rows", "message"),
     [
         ([], np.zeros((0, 7)), "0 times and 0 poses"),
-        (TIMES[:3], poses(4), "3 times and 4 poses of an observed motion"),
-        (TIMES[:3], np.zeros((3, 6)), r"has the shape \(3, 6\): give \(time, 7\)"),
-        (TIMES[:3], poses(3, _1_0=np.nan), "poses of an observed motion has a value that is not finite"),
-        ([0.0, np.inf, 0.1], poses(3), "times of an observed motion has a value that is not finite"),
-        ([0.0, 0.1, 0.1], poses(3), r"times of an observed motion must rise: 0.1 s follows 0.1 s"),
-        (TIMES[:3], poses(3, _2_3=0.5), "of observed sample 2 has length 0.5, not 1"),
+        (TIMES[:3], poses(4), "3 times and 4 poses: give one pose"),
+        (TIMES[:3], np.zeros((3, 6)), r"must be numbers in the shape \('n', 7\), not in the shape \(3, 6\)"),
+        (TIMES[:3], poses(3, _1_0=np.nan), "poses of an observed motion holds a value that is not finite"),
+        ([0.0, np.inf, 0.1], poses(3), "times of an observed motion holds a value that is not finite"),
+        ([0.0, 0.1, 0.1], poses(3), r"times must rise: 0.1 s follows 0.1 s"),
+        (TIMES[:3], poses(3, _2_3=0.5), "of pose 2 has length 0.5, not 1"),
         (TIMES[:3], poses(3, _1_0=0.15), "moves by 10.0 cm and turns by 0 degrees in the first 0.06 s"),
         (TIMES[4:8], poses(4), r"begins at 0.2 s, the predictor's samples at 0 s"),
         (

@@ -10,7 +10,8 @@ from factories import fake_batch
 from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import Outline
-from foretrace.features.outline import MAX_CORNERS, UNIT
+from foretrace.features.base import UNIT
+from foretrace.features.hull import MAX_CORNERS
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import FLOOR, LEVELS, Futures, quantiles_of
@@ -19,7 +20,7 @@ from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW
 from foretrace.objects import sample_prism
 from foretrace.predictor import OneShotConfig, OneShotPredictor
 from foretrace.predictor.mixture import along_edges
-from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, RIM, find_pivot_edges, mirror_corners
+from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, RIM, find_pivot_edges
 from foretrace.predictor.states import encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error
@@ -89,6 +90,14 @@ def test_the_ray_through_the_centre_of_mass_leaves_the_bottom_face_at_the_first_
     # The first axis points out of the object.
     outwards = ends.mean(dim=1) - torch.from_numpy(batch.com[:, 0, :2])
     assert ((axes[:, 0, :2] * outwards).sum(dim=1) > 0).all()
+
+
+def mirror_corners(corners: torch.Tensor) -> torch.Tensor:
+    """Hulls seen in a mirror along the action axis, counter-clockwise again; the first corner fills the row."""
+    count = 1 + (corners[:, 1:] != corners[:, :1]).any(dim=2).sum(dim=1, keepdim=True)
+    number = torch.arange(corners.shape[1])
+    order = torch.where(number < count, -number % count, 0)
+    return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor([1.0, -1.0])
 
 
 def test_the_second_edge_is_a_neighbour_of_the_first(batch):

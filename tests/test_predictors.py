@@ -282,8 +282,8 @@ NONSENSE = {
     "candidate 0: the object lies behind": lambda p, **more: p.imagine_candidates(
         VIEW, [LeverUp((0.0, 0.0), (-1.0, 0.0))], **more
     ),
-    "com is": lambda p, **more: p.imagine(VIEW, com=[0.1, np.nan, 0.0], **more),
-    "give a finite centre of mass": lambda p, **more: p.imagine_candidates(VIEW, [OWN], com=[0.1, 0.0], **more),
+    "com .* holds a value that is not finite": lambda p, **more: p.imagine(VIEW, com=[0.1, np.nan, 0.0], **more),
+    "com .* must be numbers in the shape": lambda p, **more: p.imagine_candidates(VIEW, [OWN], com=[0.1, 0.0], **more),
     "observed is -3: give a number of samples from 0": lambda p, **more: p.imagine_batch(
         InteractionBatch.from_views([VIEW]), observed=-3
     ),

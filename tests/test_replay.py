@@ -159,10 +159,10 @@ def frames(change: Any) -> list[list[float]]:
         ({"object": {"kind": "mesh", "file": "gone.stl"}}, "gone.stl cannot be read"),
         ({"object": {"kind": "hull", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}}, "enclose no volume"),
         ({"inertia": np.diag([1.0, 1.0, 3.0]).tolist()}, "no body has the principal inertia"),
-        ({"times": TIMES[::-1].tolist()}, "times must increase: 0.966667 s follows 1 s"),
+        ({"times": TIMES[::-1].tolist()}, "times must rise: 0.966667 s follows 1 s"),
         ({"times": TIMES[:-1].tolist()}, "30 times and 31 poses"),
         ({"times": [0.0], "poses": frames(lambda poses: None)[:1]}, "at least two frames"),
-        ({"poses": frames(lambda poses: poses.__setitem__((3, 3), 0.9))}, "of frame 3 has length 0.9, not 1"),
+        ({"poses": frames(lambda poses: poses.__setitem__((3, 3), 0.9))}, "of pose 3 has length 0.9, not 1"),
         (
             {"poses": frames(lambda poses: poses.__setitem__((3, 0), np.nan))},
             '"poses" holds a value that is not',
@@ -185,8 +185,8 @@ def test_bad_recordings_are_refused_in_one_line(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "other"}, 'it lacks "format": "foretrace-motion"'),
-        ({"version": 2}, "has format version 2, this foretrace reads 1"),
+        ({"format": "other"}, "does not describe a foretrace-motion"),
+        ({"version": 2}, "has format version 2, this foretrace reads version 1"),
         ({"units": "mm"}, "has units 'mm': convert it to \"m, kg, s\""),
         ({"recordings": []}, "at least one recording"),
         ({"recordings": [3]}, "it is no JSON object"),

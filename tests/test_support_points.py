@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from factories import fake_batch
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import FitPart, make_features, support_point_accuracy, support_points
-from foretrace.features.outlines import approximate_corners
+from foretrace.features.hull import approximate_corners
 from foretrace.features.support_points import (
     UNIT,
     RayFrame,

@@ -29,6 +29,7 @@ from foretrace.predictor import (
     TrainConfig,
     load_predictor,
     part_of,
+    parts,
     train_predictor,
 )
 from foretrace.predictor import training as training_module
@@ -365,9 +366,9 @@ def test_the_best_validation_epoch_is_kept(tmp_path, batch, monkeypatch):
     kept = []
     validate = training_module._Training._validate
 
-    def scripted(self, fixed):
+    def scripted(self):
         kept.append({name: tensor.clone() for name, tensor in self.predictor.state_dict().items()})
-        return validate(self, fixed) | {"validation_loss": next(losses)}
+        return validate(self) | {"validation_loss": next(losses)}
 
     monkeypatch.setattr(training_module._Training, "_validate", scripted)
     tensors = load_file(train(batch, tmp_path / "run") / "model.safetensors")
@@ -495,7 +496,7 @@ def test_data_sets_larger_than_memory_train_the_same(tmp_path, monkeypatch, conf
     for name in ("config.json", "split.json", "model.safetensors"):
         assert (pieces / name).read_bytes() == (whole / name).read_bytes(), name
     assert part_of(pieces, data).ids.tolist() == part_of(whole, data.batch()).ids.tolist()
-    monkeypatch.setattr(training_module, "LARGE", 0)
+    monkeypatch.setattr(parts, "LARGE", 0)
     single = train(data, tmp_path / "single", config=config)
     losses = [[float(row["train_loss"]) for row in rows(run)] for run in (whole, single)]
     np.testing.assert_allclose(*losses, rtol=1e-3)

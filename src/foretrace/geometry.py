@@ -10,8 +10,36 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from foretrace.errors import ForetraceError
+
 Numbers = np.ndarray | Sequence[Any]
 """What users may give for an array: an array, or lists or tuples of numbers, nested."""
+
+
+def finite_array(
+    name: str, values: Any, shape: Sequence[int | None], error: type[ForetraceError]
+) -> Float[np.ndarray, "..."]:
+    """Finite numbers in a shape, as an array of their own.
+
+    Args:
+        name: Name of the values in messages.
+        values: What was given.
+        shape: The shape; None in it stands for any length.
+        error: The class to raise.
+
+    Raises:
+        ForetraceError: Of the given class: the values are no numbers, have another shape, or are not finite.
+    """
+    wanted = f"numbers in the shape {tuple('n' if n is None else n for n in shape)}" if shape else "a number"
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise error(f"{name} must be {wanted}") from None
+    if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+        raise error(f"{name} must be {wanted}, not in the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise error(f"{name} holds a value that is not finite: leave it out or correct it")
+    return array
 
 
 def cross(

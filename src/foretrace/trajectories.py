@@ -7,6 +7,11 @@ from dtaidistance import dtw, dtw_ndim
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
+from foretrace.errors import ForetraceError
+
+UNIT_TOLERANCE = 1e-3
+"""Largest deviation of a quaternion's length from 1."""
+
 
 class Alignment(NamedTuple):
     """Two trajectories in step with each other."""
@@ -92,6 +97,33 @@ def rotation_error(
     apart = np.linalg.norm(a - b, axis=-1)
     together = np.linalg.norm(a + b, axis=-1)
     return 4 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together))
+
+
+def check_poses(
+    times: Float[np.ndarray, " time"], poses: Float[np.ndarray, "n 7"], error: type[ForetraceError]
+) -> None:
+    """Refuse what is no motion sampled over time.
+
+    Args:
+        times: Times [s].
+        poses: Positions [m] and quaternions (w, x, y, z).
+        error: The class to raise.
+
+    Raises:
+        ForetraceError: Of the given class: there is no time or not one pose for each, times do not rise, or a
+            quaternion has another length than 1.
+    """
+    if len(times) != len(poses) or len(times) == 0:
+        raise error(f"{len(times)} times and {len(poses)} poses: give one pose for each time")
+    if (steps := np.diff(times)).size and steps.min() <= 0:
+        k = int((steps <= 0).argmax())
+        raise error(f"times must rise: {times[k + 1]:g} s follows {times[k]:g} s")
+    lengths = np.linalg.norm(poses[:, 3:], axis=1)
+    if (wrong := np.abs(lengths - 1) > UNIT_TOLERANCE).any():
+        k = int(wrong.argmax())
+        raise error(
+            f"the quaternion (w, x, y, z) of pose {k} has length {lengths[k]:.4g}, not 1: normalise it"
+        )
 
 
 def interpolate_poses(

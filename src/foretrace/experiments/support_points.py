@@ -9,7 +9,12 @@ from jaxtyping import Float
 
 from foretrace.errors import TrainingError
 from foretrace.features import FeatureExtractor, FitPart, Option, make_features
-from foretrace.features.support_points import hull_and_com, named_right, order_points, points_of
+from foretrace.features.support_points import (
+    hull_and_com,
+    is_correct,
+    order_points,
+    points_of,
+)
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import Split
 
@@ -56,7 +61,7 @@ def support_point_metrics(
     else:
         extractor = _fitted(features, batch, split, seed, options)
         right, right_from_mask = (
-            named_right(points_of(extractor(extractor.inputs(known))), test.corners, test.support_points)
+            is_correct(points_of(extractor(extractor.inputs(known))), test.corners, test.support_points)
             for known in (test, seen)
         )
     counts = np.unique(test.num_corners).tolist()
@@ -94,5 +99,5 @@ def _chances(known: InteractionBatch, truth: InteractionBatch) -> Float[np.ndarr
         levered = np.linalg.norm(edges[:, 0] + nearest[:, None] * along, axis=-1).argmin()
         others = order_points(np.delete(edges, levered, axis=0))
         one = truth[np.full(len(others), row)]
-        chances[row] = named_right(others, one.corners, one.support_points).mean()
+        chances[row] = is_correct(others, one.corners, one.support_points).mean()
     return chances

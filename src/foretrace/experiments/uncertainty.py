@@ -51,9 +51,9 @@ from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
 from foretrace.predictor import OneShotPredictor, load_predictor
 from foretrace.predictor.config import Device
-from foretrace.predictor.one_shot import FEW
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_lengths
+from foretrace.predictor.trajectory_basis import FEW
 
 Setting = Literal["shuffled", "novel-shapes"]
 """How the split is drawn."""

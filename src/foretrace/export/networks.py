@@ -5,7 +5,8 @@ import numpy as np
 from foretrace.actions import LeverUp
 from foretrace.errors import ViewError
 from foretrace.features import Outline
-from foretrace.features.outline import MAX_CORNERS, UNIT
+from foretrace.features.base import UNIT
+from foretrace.features.hull import MAX_CORNERS
 from foretrace.geometry import convex_hull
 from foretrace.imagined import estimate_com
 from foretrace.interactions.dataset import InteractionBatch

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features.base import FeatureExtractor
-from foretrace.features.outlines import mask_contour
+from foretrace.features.hull import mask_contour
 from foretrace.interactions.dataset import InteractionBatch
 
 NUM_POINTS = 500

@@ -10,15 +10,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from foretrace.errors import PredictionError, TrainingError
-from foretrace.features.base import FeatureExtractor, FitPart
+from foretrace.features.base import UNIT, FeatureExtractor, FitPart
 from foretrace.features.cnn import initialise_rectified
 from foretrace.features.fitting import FitConfig, fit_network
-from foretrace.features.outlines import approximate_corners, mask_contour
+from foretrace.features.hull import approximate_corners, mask_contour
 from foretrace.geometry import convex_hull, cross, polygon_centroid, support_edge
 from foretrace.interactions.dataset import InteractionBatch
 
-UNIT = 0.1
-"""Coordinates are divided by this to be of unit scale [m]."""
 WIDTH = 128
 """Units of each layer of the network (paper, section 3.4)."""
 NO_DISTANCE = 1e-6
@@ -100,7 +98,7 @@ def points_of(features: Float[Tensor, "batch 4"]) -> Float[np.ndarray, "batch 2 
     return UNIT * features.detach().double().cpu().numpy().reshape(-1, 2, 2)
 
 
-def named_right(
+def is_correct(
     predicted: Float[np.ndarray, "batch 2 2"],
     corners: Float[np.ndarray, "batch corners 2"],
     observed: Float[np.ndarray, "batch 2 2"],
@@ -130,13 +128,13 @@ def support_point_accuracy(
 ) -> float:
     """Share of the interactions of which both support corners are right (paper, section 5.1).
 
-    See `named_right`. Interactions without observed support points are left out.
+    See `is_correct`. Interactions without observed support points are left out.
 
     Returns:
         Between 0 and 1; NaN where nothing was observed at all.
     """
     seen = np.isfinite(observed).all(axis=(1, 2))
-    return float(named_right(predicted, corners, observed)[seen].mean()) if seen.any() else float("nan")
+    return float(is_correct(predicted, corners, observed)[seen].mean()) if seen.any() else float("nan")
 
 
 # --- features ---------------------------------------------------------------------------------------------

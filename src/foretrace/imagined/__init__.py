@@ -3,6 +3,7 @@
 Nothing here imports a learning library: a predictor that was trained is one kind of imaginer among others.
 """
 
+from foretrace.imagined.domain import estimate_com
 from foretrace.imagined.futures import (
     FLOOR,
     LEVELS,
@@ -13,9 +14,8 @@ from foretrace.imagined.futures import (
     conformal_scores,
     quantiles_of,
 )
-from foretrace.imagined.imaginer import STARTS, Imaginer, Start
+from foretrace.imagined.imaginer import STARTS, Imaginer, Scenes, Start
 from foretrace.imagined.observed import ObservedMotion
-from foretrace.imagined.scenes import Scenes, estimate_com
 
 __all__ = [
     "FLOOR",

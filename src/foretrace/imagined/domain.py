@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from foretrace.errors import PredictionError
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
+from foretrace.interactions.batch import Candidates, InteractionBatch
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 
 LARGEST_GAP = 0.02
 """Largest distance of a contact point from the object's rim, outside or inside [m]."""
@@ -41,14 +41,14 @@ OWN = np.zeros((1, 2)), np.array([[1.0, 0.0]])
 """Contact point and direction of a view's own action."""
 
 
-def check_view(view: TopDownView) -> None:
+def check_view(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> None:
     """Refuse a view that does not show one object, levered at its rim.
 
     Raises:
         PredictionError: See `check_object` and `check_contacts`.
     """
-    check_object(view.mask, view.height)
-    check_contacts(view.mask, *OWN)
+    check_object(mask, height)
+    check_contacts(mask, *OWN)
 
 
 def check_object(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> None:
@@ -181,22 +181,17 @@ def measure(
     }
 
 
-def measure_from(
-    view: TopDownView,
-    contacts: Float[np.ndarray, "n 2"],
-    directions: Float[np.ndarray, "n 2"],
-    com: Float[np.ndarray, "n 3"],
+def measure_candidates(
+    candidates: Candidates, com: Float[np.ndarray, "n 3"]
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """The same of one object as seen from the frames of several actions.
 
     Args:
-        view: The object.
-        contacts: Contact points in the view's frame [m].
-        directions: Unit vectors of the actions in that frame.
+        candidates: The object and the actions.
         com: Its centre of mass at rest in the frame of each action [m].
     """
-    x, y = _along(_rim(view.mask), contacts, directions)
-    number = len(contacts)
+    view, number = candidates.view, len(candidates.actions)
+    x, y = _along(_rim(view.mask), candidates.contacts, candidates.directions)
     return {
         "area": np.full(number, np.count_nonzero(view.mask) * METRES_PER_PIXEL**2),
         "length": np.ptp(x, axis=1) + METRES_PER_PIXEL,
@@ -204,6 +199,26 @@ def measure_from(
         "height": np.full(number, float(view.height.max())),
         "distance": np.hypot(com[:, 0], com[:, 1]),
     }
+
+
+def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
+    """Centres of mass at rest in the action frame [m], estimated from the views.
+
+    Above the centre of each mask's area, at half the object's greatest height: right for a prism of uniform
+    density but for its bevel.
+
+    Raises:
+        PredictionError: A mask is empty.
+    """
+    across, along = batch.mask.sum(axis=2), batch.mask.sum(axis=1)
+    areas = across.sum(axis=1)
+    if not areas.all():
+        raise PredictionError(
+            f"the mask of interaction {batch.ids[np.argmin(areas)]} is empty: see that the camera sees the object"
+        )
+    rows, columns = (counts @ np.arange(counts.shape[1]) / areas for counts in (across, along))
+    points = (CONTACT_PIXEL - np.stack([rows, columns], axis=-1)) * METRES_PER_PIXEL
+    return np.concatenate([points, batch.height.max(axis=(1, 2))[:, None] / 2], axis=-1)
 
 
 def _extent(filled: np.ndarray) -> Float[np.ndarray, " batch"]:

@@ -3,7 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Literal, final
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions import Action
 from foretrace.errors import PredictionError
-from foretrace.geometry import Numbers
+from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined.context import (
     PARAMETERS,
     column_of,
@@ -20,11 +21,17 @@ from foretrace.imagined.context import (
     parameters_of,
     recorded_context,
 )
-from foretrace.imagined.domain import OWN, check_contacts, check_object, check_view
+from foretrace.imagined.domain import (
+    check_contacts,
+    check_object,
+    check_view,
+    estimate_com,
+    measure,
+    measure_candidates,
+)
 from foretrace.imagined.futures import ImaginedBatch, ImaginedEffect
 from foretrace.imagined.observed import SAME_TIME, ObservedMotion, observed_motion, rotations_since_rest
-from foretrace.imagined.scenes import Scenes, estimate_com
-from foretrace.interactions.candidates import Candidates
+from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Effect
 from foretrace.interactions.topdown import TopDownView
@@ -32,6 +39,35 @@ from foretrace.interactions.topdown import TopDownView
 Start = Literal["observed", "estimated"]
 """Where a motion's centre of mass at rest comes from: the first recorded sample, or the view from above."""
 STARTS: tuple[Start, ...] = ("observed", "estimated")
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """What is to be imagined, checked; one row for each action."""
+
+    source: InteractionBatch | Candidates
+    """Interactions of which everything before the action may be read; or candidates."""
+    com: Float[np.ndarray, "batch 3"]
+    """Centres of mass at rest in the action frame [m]."""
+    context: Float[np.ndarray, "batch context"]
+    """Values of the imaginer's context [SI]."""
+    observed: Float[np.ndarray, "batch samples 6"] | None = None
+    """Motions' first samples at the imaginer's sample times, where they are under way: centre of mass in the action
+    frame [m] and rotation vector since rest [rad]."""
+
+    def __len__(self) -> int:
+        return len(self.com)
+
+    @cached_property
+    def batch(self) -> InteractionBatch:
+        """The objects in the frames of the actions."""
+        return self.source.batch() if isinstance(self.source, Candidates) else self.source
+
+    def measure(self) -> dict[str, Float[np.ndarray, " batch"]]:
+        """Measures by which objects are compared, see `foretrace.imagined.domain.MEASURES`."""
+        if isinstance(self.source, Candidates):
+            return measure_candidates(self.source, self.com)
+        return measure(self.source, self.com)
 
 
 class Imaginer(ABC):
@@ -93,7 +129,7 @@ class Imaginer(ABC):
         """
         self._check_sight()
         _check_type("view", view, TopDownView)
-        check_view(view)
+        check_view(view.mask, view.height)
         parameters = {}
         if action is not None:
             _check_type("action", action, Action)
@@ -133,8 +169,7 @@ class Imaginer(ABC):
             raise PredictionError(f"observed is {observed!r}: give a number of samples from 0 to {most}")
         for id, mask, height in zip(batch.ids, batch.mask, batch.height, strict=True):
             with _naming(f"interaction {id}: "):
-                check_object(mask, height)
-                check_contacts(mask, *OWN)
+                check_view(mask, height)
         values = recorded_context(batch, self.context)
         com = estimate_com(batch)
         if start == "observed":
@@ -241,10 +276,4 @@ def _check_type(name: str, value: object, kind: type) -> None:
 
 
 def _point(com: Numbers) -> Float[np.ndarray, "3"]:
-    try:
-        point = np.array(com, dtype=float)
-    except (TypeError, ValueError):
-        point = np.full(0, np.nan)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise PredictionError(f"com is {com}: give a finite centre of mass (x, y, z) [m], or none")
-    return point
+    return finite_array("the centre of mass com (x, y, z) [m]", com, (3,), PredictionError)

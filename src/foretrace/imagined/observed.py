@@ -8,15 +8,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from foretrace.errors import PredictionError
-from foretrace.geometry import Numbers, continuous_rotation_vectors, quaternion_to_matrix
+from foretrace.geometry import Numbers, continuous_rotation_vectors, finite_array, quaternion_to_matrix
 from foretrace.interactions.record import Effect
+from foretrace.trajectories import check_poses
 
 SAME_TIME = 1e-9
 """Times that differ by less are the same [s]."""
 LATEST_START = 0.025
 """An observed motion begins at most this long after the imaginer's first sample [s]: half a sample period."""
-UNIT_TOLERANCE = 1e-3
-"""Largest deviation of a quaternion's length from 1."""
 REST_TIME = 0.06
 """The object rests for this long at the beginning [s]: the blade has not touched it yet."""
 REST_DISTANCE = 0.01
@@ -43,23 +42,21 @@ class ObservedMotion:
     along with the object."""
 
     def __init__(self, times: Numbers, poses: Numbers, com: Numbers | None = None) -> None:
-        for name, values, width in (("times", times, None), ("poses", poses, 7), ("com", com, 3)):
-            object.__setattr__(self, name, None if values is None else _numbers(name, values, width))
-        lengths = {len(values) for values in (self.times, self.poses, self.com) if values is not None}
-        if len(lengths) > 1 or not len(self.times):
-            raise PredictionError(
-                f"{len(self.times)} times and {len(self.poses)} poses of an observed motion: give one pose a time"
+        for name, values, shape in (
+            ("times", times, (None,)),
+            ("poses", poses, (None, 7)),
+            ("com", com, (None, 3)),
+        ):
+            array = (
+                None
+                if values is None
+                else finite_array(f"{name} of an observed motion", values, shape, PredictionError)
             )
-        if (steps := np.diff(self.times)).size and steps.min() <= 0:
-            k = int(steps.argmin())
+            object.__setattr__(self, name, array)
+        check_poses(self.times, self.poses, PredictionError)
+        if self.com is not None and len(self.com) != len(self.times):
             raise PredictionError(
-                f"times of an observed motion must rise: {self.times[k + 1]:g} s follows {self.times[k]:g} s"
-            )
-        sizes = np.linalg.norm(self.poses[:, 3:], axis=1)
-        if (wrong := np.abs(sizes - 1) > UNIT_TOLERANCE).any():
-            k = int(wrong.argmax())
-            raise PredictionError(
-                f"the quaternion (w, x, y, z) of observed sample {k} has length {sizes[k]:.4g}, not 1: normalise it"
+                f"{len(self.times)} times and {len(self.com)} com: give one centre of mass for each time"
             )
         first = self.times <= self.times[0] + REST_TIME
         moved = np.linalg.norm(self.poses[first, :3] - self.poses[0, :3], axis=1).max()
@@ -141,19 +138,3 @@ def observed_motion(observed: Any) -> ObservedMotion:
         f"observed is a {type(observed).__name__}: give an Effect, or ObservedMotion(times, poses) with the object's "
         "poses in the action frame"
     )
-
-
-def _numbers(name: str, values: Numbers, width: int | None) -> np.ndarray:
-    """Finite numbers in the shape (time,) or (time, width)."""
-    wanted = "(time,)" if width is None else f"(time, {width})"
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise PredictionError(f"{name} of an observed motion: give numbers in the shape {wanted}") from None
-    if array.shape[1:] != (() if width is None else (width,)) or array.ndim == 0:
-        raise PredictionError(f"{name} of an observed motion has the shape {array.shape}: give {wanted}")
-    if not np.isfinite(array).all():
-        raise PredictionError(
-            f"{name} of an observed motion has a value that is not finite: leave out what comes from it on"
-        )
-    return array

@@ -1,12 +1,10 @@
-"""Interactions in memory: `Dataset` reads them from disk, `InteractionBatch` is what learners read."""
+"""Interactions on disk, read as they are needed."""
 
 import json
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +12,14 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from foretrace.actions import ACTIONS, FAILED, action_transform
+from foretrace.actions import ACTIONS, FAILED
 from foretrace.errors import DatasetError
 from foretrace.interactions import storage
+from foretrace.interactions.batch import InteractionBatch as InteractionBatch
+from foretrace.interactions.batch import batch_of, common_times
 from foretrace.interactions.record import Interaction
-from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, object_from_dict
 
 CACHE_BYTES = 256 * 2**20
@@ -35,106 +34,6 @@ INDEX_COLUMNS = [
     if field.name not in (*storage.TRAJECTORIES, "joint_trajectory", "mask", "height", "object")
 ]
 """Columns that are always in memory: some 600 bytes a row."""
-
-
-@dataclass(frozen=True)
-class InteractionBatch:
-    """Many interactions as arrays, in the action frame; what every feature and predictor reads."""
-
-    ids: Int[np.ndarray, " batch"]
-    """Number of each interaction within its data set."""
-    mask: Bool[np.ndarray, "batch 128 128"]
-    """Top-down masks."""
-    height: Float[np.ndarray, "batch 128 128"]
-    """Top-down height maps [m], 0 outside the object."""
-    corners: Float[np.ndarray, "batch corners 2"]
-    """Corners of each object in the action frame at rest [m], counter-clockwise, NaN-padded."""
-    num_corners: Int[np.ndarray, " batch"]
-    """How many of them each object has."""
-    object_ids: Int[np.ndarray, " batch"]
-    """Which object was levered: equal numbers are the same object."""
-    times: Float[np.ndarray, " time"]
-    """Sample times [s], common to all."""
-    com: Float[np.ndarray, "batch time 3"]
-    """Centre-of-mass trajectories [m]; NaN past the end of a shorter one."""
-    pose: Float[np.ndarray, "batch time 7"]
-    """Pose trajectories of the object frame: position [m], quaternion (w, x, y, z)."""
-    length: Int[np.ndarray, " batch"]
-    """Number of valid samples of each trajectory."""
-    slip_index: Int[np.ndarray, " batch"]
-    """First sample off the tool after having been lifted; ``length`` where that never happened."""
-    support_points: Float[np.ndarray, "batch 2 2"]
-    """Observed support points in the action frame [m]; NaN where not observed."""
-    outcome: np.ndarray
-    """(batch,) array of outcome names (str)."""
-    parameters: dict[str, np.ndarray]
-    """(batch,) arrays by name [SI]: physical constants as in `Physics`, and parameters of the actions; NaN where an
-    interaction has no such one."""
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def __getitem__(self, rows: Any) -> "InteractionBatch":
-        """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all."""
-        kept = {
-            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("times", "parameters")
-        }
-        parameters = {name: values[rows] for name, values in self.parameters.items()}
-        return replace(self, **kept, parameters=parameters)
-
-    def batches(self, size: int | None = None) -> Iterator["InteractionBatch"]:
-        """The same in parts of a number of rows, in order; by default in one."""
-        size = size or max(1, len(self))
-        return (self[start : start + size] for start in range(0, len(self), size))
-
-    @classmethod
-    def from_interactions(cls, interactions: Sequence[Interaction]) -> "InteractionBatch":
-        """Interactions as arrays; objects that are equal get equal ``object_ids``, counted from 0.
-
-        Raises:
-            DatasetError: Two of them were sampled at different times.
-        """
-        descriptions = [json.dumps(interaction.object.to_dict()) for interaction in interactions]
-        numbers = {description: k for k, description in enumerate(dict.fromkeys(descriptions))}
-        rows = [
-            storage.encode(interaction, numbers[description])
-            for interaction, description in zip(interactions, descriptions, strict=True)
-        ]
-        known = dict(zip(descriptions, (interaction.object for interaction in interactions), strict=True))
-        return _batch(storage.to_table(rows), known)
-
-    @classmethod
-    def from_views(
-        cls,
-        views: Sequence[TopDownView],
-        times: Float[np.ndarray, " time"] | None = None,
-        corners: Sequence[Float[np.ndarray, "_ 2"]] | None = None,
-    ) -> "InteractionBatch":
-        """Actions whose effect is still to be imagined: everything that was not observed is NaN, or empty.
-
-        Args:
-            views: What the camera sees of each object, in the action frame.
-            times: Times at which the effect will be imagined [s]; by default none.
-            corners: Corners of each object in the action frame [m], if known.
-        """
-        n, times = len(views), np.zeros(0) if times is None else times
-        corners = [np.zeros((0, 2))] * n if corners is None else corners
-        return cls(
-            ids=np.arange(n),
-            mask=np.array([view.mask for view in views], dtype=bool).reshape(n, *_VIEW_SHAPE),
-            height=np.array([view.height for view in views], dtype=np.float32).reshape(n, *_VIEW_SHAPE),
-            corners=_padded(corners, 2),
-            num_corners=np.array([len(c) for c in corners], dtype=np.int64),
-            object_ids=np.arange(n),
-            times=times,
-            com=np.full((n, len(times), 3), np.nan),
-            pose=np.full((n, len(times), 7), np.nan),
-            length=np.zeros(n, dtype=np.int64),
-            slip_index=np.zeros(n, dtype=np.int64),
-            support_points=np.full((n, 2, 2), np.nan),
-            outcome=_outcome_array([""] * n),
-            parameters={},
-        )
 
 
 class Dataset:
@@ -202,8 +101,8 @@ class Dataset:
         return self._view(np.arange(len(self))[rows])
 
     def __iter__(self) -> Iterator[Interaction]:
-        for start in range(0, len(self), ROWS_AT_ONCE):
-            yield from map(self._decode, self._rows(slice(start, start + ROWS_AT_ONCE)).to_pylist())
+        for table in self._pieces():
+            yield from map(self._decode, table.to_pylist())
 
     @property
     def table(self) -> pa.Table:
@@ -253,7 +152,7 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
-        return self._batch(self.table, self.times)
+        return self._batch(self.table)
 
     def batches(self, size: int = ROWS_AT_ONCE) -> Iterator[InteractionBatch]:
         """All of them as arrays, a number of rows at a time; sample times are common to all.
@@ -261,8 +160,8 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
-        for start in range(0, len(self), size):
-            yield self._batch(self._rows(slice(start, start + size)), self.times)
+        for table in self._pieces(size=size):
+            yield self._batch(table)
             pa.default_memory_pool().release_unused()
 
     @property
@@ -274,10 +173,8 @@ class Dataset:
     def lengths(self) -> Int[np.ndarray, " batch"]:
         """Number of samples of each trajectory."""
         parts = [
-            pc.list_value_length(  # pyright: ignore[reportAttributeAccessIssue]
-                self._rows(slice(start, start + ROWS_AT_ONCE), ["times"])["times"]
-            ).to_numpy()
-            for start in range(0, len(self), ROWS_AT_ONCE)
+            pc.list_value_length(table["times"]).to_numpy()  # pyright: ignore[reportAttributeAccessIssue]
+            for table in self._pieces(["times"])
         ]
         return np.concatenate([np.zeros(0, dtype=np.int64), *parts]).astype(np.int64)
 
@@ -288,15 +185,7 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
-        found: dict[bytes, tuple[int, np.ndarray]] = {}  # an interaction of each kind of times
-        for start in range(0, len(self), ROWS_AT_ONCE):
-            table = self._rows(slice(start, start + ROWS_AT_ONCE), ["id", "times"])
-            for id, row in zip(table["id"].to_pylist(), _lists(table, "times", 1), strict=True):
-                found.setdefault(row.tobytes(), (id, row[:, 0].copy()))
-        longest = max((row for _, row in found.values()), key=len, default=np.zeros(0))
-        for id, row in found.values():
-            _check_times(id, row, longest)
-        return longest
+        return common_times(self._pieces(["id", "times"]))
 
     def to_pandas(self) -> pd.DataFrame:
         """The rows as a data frame, trajectories flattened, images packed."""
@@ -308,9 +197,8 @@ class Dataset:
 
     def objects(self) -> Iterator[dict[str, Any]]:
         """Descriptions of the objects, row by row, as of ``ObjectModel.to_dict``."""
-        for start in range(0, len(self), ROWS_AT_ONCE):
-            for text in self._rows(slice(start, start + ROWS_AT_ONCE), ["object"])["object"].to_pylist():
-                yield json.loads(text)
+        for table in self._pieces(["object"]):
+            yield from map(json.loads, table["object"].to_pylist())
 
     def _outcome_names(self) -> list[str]:
         """Outcomes that its actions can have, and any other that it holds."""
@@ -357,10 +245,14 @@ class Dataset:
         ]
         return pa.concat_tables([storage.SCHEMA.empty_table().select(names), *parts])
 
-    def _batch(self, table: pa.Table, times: np.ndarray) -> InteractionBatch:
-        for description in table["object"].unique().to_pylist():
-            self._object(description)
-        return _batch(table, self._objects, times)
+    def _pieces(self, columns: list[str] | None = None, size: int = ROWS_AT_ONCE) -> Iterator[pa.Table]:
+        """All rows with all or some columns, a number of rows at a time."""
+        return (self._rows(slice(start, start + size), columns) for start in range(0, len(self), size))
+
+    def _batch(self, table: pa.Table) -> InteractionBatch:
+        descriptions = table["object"].unique().to_pylist()
+        objects = {description: self._object(description) for description in descriptions}
+        return batch_of(table, objects, self.times)
 
     def _decode(self, row: dict[str, Any]) -> Interaction:
         return storage.decode(row, self._object(row["object"]))
@@ -419,74 +311,3 @@ def count_outcomes(outcomes: Sequence[str]) -> dict[str, int]:
     counts = Counter(map(str, outcomes))
     known = [str(name) for action in ACTIONS.values() for name in action.outcomes]
     return {name: counts[name] for name in dict.fromkeys([*known, FAILED, *counts]) if counts[name]}
-
-
-_VIEW_SHAPE = (storage.VIEW_SIZE, storage.VIEW_SIZE)
-
-
-def _outcome_array(outcomes: Sequence[str]) -> np.ndarray:
-    """Names as an array whose width, and so its bytes, does not depend on which of a lever-up's outcomes occur."""
-    return np.array(outcomes, dtype=f"<U{max(8, *map(len, outcomes), 0)}")
-
-
-def _padded(arrays: Sequence[np.ndarray], width: int, longest: int | None = None) -> np.ndarray:
-    """(n, longest, width) from arrays of (k, width), NaN past the end of each."""
-    longest = max((len(a) for a in arrays), default=0) if longest is None else longest
-    padded = np.full((len(arrays), longest, width), np.nan)
-    for k, array in enumerate(arrays):
-        padded[k, : len(array)] = array
-    return padded
-
-
-def _lists(table: pa.Table, name: str, width: int) -> list[np.ndarray]:
-    """A list column as one (k, width) array per row, without a copy."""
-    column = table[name].combine_chunks()
-    flat, offsets = column.values.to_numpy(zero_copy_only=False), column.offsets.to_numpy()
-    return [flat[a:b].reshape(-1, width) for a, b in pairwise(offsets)]
-
-
-def _check_times(id: int, times: np.ndarray, longest: np.ndarray) -> None:
-    if not np.allclose(times, longest[: len(times)], rtol=0, atol=1e-9):
-        raise DatasetError(f"interaction {id} was sampled at other times than the rest; batch it apart")
-
-
-def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:
-    """Each object's corners in its action's frame at rest [m]."""
-    corners = []
-    columns = (table[name].to_pylist() for name in ("object", "contact", "direction"))
-    for description, contact, direction in zip(*columns, strict=True):
-        unit = np.array(direction)
-        # Dividing by a length of almost 1 again keeps features as they have always been, to the last bit.
-        T_action_object = action_transform(np.array(contact), unit / np.linalg.norm(unit))
-        corners.append(objects[description].corners @ T_action_object[:2, :2].T + T_action_object[:2, 3])
-    return corners
-
-
-def _batch(
-    table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndarray | None = None
-) -> InteractionBatch:
-    rows = [row[:, 0] for row in _lists(table, "times", 1)]
-    if times is None:
-        times = max(rows, key=len, default=np.zeros(0)).copy()
-        for id, row in zip(table["id"].to_pylist(), rows, strict=True):
-            _check_times(id, row, times)
-    length = np.array([len(row) for row in rows], dtype=np.int64)
-    corners = _corners_in_action(table, objects)
-    slip_index = table["slip_index"].to_numpy()
-    constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
-    return InteractionBatch(
-        ids=table["id"].to_numpy(),
-        mask=storage.unpack_masks(table["mask"].to_pylist()),
-        height=storage.unpack_heights(table["height"].to_pylist()),
-        corners=_padded(corners, 2),
-        num_corners=np.array([len(c) for c in corners], dtype=np.int64),
-        object_ids=table["object_id"].to_numpy(),
-        times=times,
-        com=_padded(_lists(table, "com_trajectory", 3), 3, len(times)),
-        pose=_padded(_lists(table, "pose_trajectory", 7), 7, len(times)),
-        length=length,
-        slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
-        support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
-        outcome=_outcome_array(table["outcome"].to_pylist()),
-        parameters=constants | storage.parameter_values(table),
-    )

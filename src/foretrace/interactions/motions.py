@@ -1,6 +1,5 @@
-"""Recorded motions of rigid bodies: the file format, read with every doubt spelled out."""
+"""Recorded motions of rigid bodies: the file format, and the checks of what is read."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,15 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import DatasetError, ForetraceError, SimulationError
-from foretrace.geometry import continuous_quaternions
+from foretrace.files import read_versioned
+from foretrace.geometry import continuous_quaternions, finite_array
 from foretrace.objects import NO_BEVEL, MassProperties, Prism
 from foretrace.objects.body import Body
+from foretrace.trajectories import check_poses
 
 FORMAT = "foretrace-motion"
 VERSION = 1
 UNITS = "m, kg, s"
-UNIT_TOLERANCE = 1e-3
-"""A quaternion's length may differ from 1 by this."""
+REMEDY = "give a file of recorded motions"
 DEEPEST_START = 0.005
 """Noise may put a body this far into the table at the start [m]; it is lifted out."""
 SHAPES = ("box", "cylinder", "hull", "prism", "mesh")
@@ -82,18 +82,7 @@ def read_recordings(path: str | Path) -> list[Recording]:
         DatasetError: If the file cannot be read or does not hold what the format asks for.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DatasetError(f"recording {path} does not exist: check the path") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"recording {path} cannot be read: {error}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise DatasetError(f'{path} is no recording: it lacks "format": "{FORMAT}"')
-    if content.get("version") != VERSION:
-        raise DatasetError(
-            f"{path} has format version {content.get('version')}, this foretrace reads {VERSION}"
-        )
+    content = read_versioned(path, FORMAT, VERSION, DatasetError, REMEDY, key="version")
     if content.get("units") != UNITS:
         raise DatasetError(f'{path} has units {content.get("units")!r}: convert it to "{UNITS}"')
     entries = content.get("recordings")
@@ -143,19 +132,10 @@ def _recording(entry: Any, name: str, folder: Path) -> Recording:
 def _motion(entry: dict[str, Any]) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, "time 7"]]:
     times = _numbers(entry, "times", (None,))
     poses = _numbers(entry, "poses", (None, 7))
-    if len(times) != len(poses):
-        raise DatasetError(f"{len(times)} times and {len(poses)} poses: there must be one pose for each time")
+    check_poses(times, poses, DatasetError)
     if len(times) < 2:
         raise DatasetError("a motion needs at least two frames")
-    steps = np.diff(times)
-    if (steps <= 0).any():
-        k = int((steps <= 0).argmax())
-        raise DatasetError(f"times must increase: {times[k + 1]:g} s follows {times[k]:g} s")
     lengths = np.linalg.norm(poses[:, 3:], axis=1)
-    wrong = np.abs(lengths - 1) > UNIT_TOLERANCE
-    if wrong.any():
-        k = int(wrong.argmax())
-        raise DatasetError(f"the quaternion (w, x, y, z) of frame {k} has length {lengths[k]:.4g}, not 1")
     quaternions = continuous_quaternions(poses[:, 3:] / lengths[:, None])
     return times - times[0], np.concatenate([poses[:, :3], quaternions], axis=1)
 
@@ -216,15 +196,5 @@ def _numbers(
     """Finite numbers in a shape; None in the shape stands for any length."""
     if entry.get(key) is None and default is None:
         raise DatasetError(f'"{key}" is missing')
-    wanted = (
-        "a number" if not shape else f"numbers in the shape {tuple('n' if n is None else n for n in shape)}"
-    )
-    try:
-        values = np.array(default if entry.get(key) is None else entry[key], dtype=float)
-    except (TypeError, ValueError):
-        raise DatasetError(f'"{key}" must be {wanted}') from None
-    if values.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
-        raise DatasetError(f'"{key}" must be {wanted}, not in the shape {values.shape}')
-    if not np.isfinite(values).all():
-        raise DatasetError(f'"{key}" holds a value that is not finite')
-    return values
+    values = default if entry.get(key) is None else entry[key]
+    return finite_array(f'"{key}"', values, shape, DatasetError)

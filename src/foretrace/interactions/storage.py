@@ -169,16 +169,9 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
 
 def decode_action(row: Mapping[str, Any]) -> Action:
     """The commanded action in one row."""
-    path, tool = json.loads(row["path"]), json.loads(row["tool"])
-    return Action.from_dict(
-        {
-            "label": row["action"],
-            "contact": row["contact"],
-            "direction": row["direction"],
-            "path": path,
-            "tool": tool,
-        }
-    )
+    place = {name: row[name] for name in ("contact", "direction")}
+    settings = {name: json.loads(row[name]) for name in ("path", "tool")}
+    return Action.from_dict({"label": row["action"], **place, **settings})
 
 
 def parameter_values(table: pa.Table) -> dict[str, np.ndarray]:

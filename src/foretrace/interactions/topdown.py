@@ -187,9 +187,22 @@ class TopDownView:
         """Outline of the largest object in the mask, counter-clockwise in the action frame [m]."""
         if not self.mask.any():
             raise ViewError("the view's mask is empty: it has no contour")
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(self.mask.astype(np.uint8), connectivity=8)
-        largest = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-        return self.to_metres(mask_outline(largest)[::-1])
+        return outline_of(self.mask)
+
+
+def largest_object(mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """The largest of the objects in a mask; pixels that touch at a corner belong together."""
+    pixels = np.ascontiguousarray(mask).view(np.uint8)
+    outlines, _ = cv2.findContours(pixels, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    if len(outlines) == 1:  # one object without holes, as nearly always: labels would take longer to find
+        return mask
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
+    return labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+
+
+def outline_of(mask: Bool[np.ndarray, "128 128"]) -> Float[np.ndarray, "k 2"]:
+    """Outline of the largest object in a view's mask, counter-clockwise in the action frame [m]."""
+    return _metres_of(mask_outline(largest_object(mask))[::-1])
 
 
 def _pixels_of(

@@ -10,6 +10,7 @@ import numpy as np
 
 from foretrace.objects.model import fitting_bevel
 from foretrace.objects.prism import CIRCLE_RADIUS, Prism
+from foretrace.objects.solid import rectangle
 
 
 def on_circle(degrees: Sequence[int]) -> Prism:
@@ -20,7 +21,7 @@ def on_circle(degrees: Sequence[int]) -> Prism:
 
 def slab(length: float, width: float, height: float) -> Prism:
     """A rectangular slab [m]."""
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [length / 2, width / 2]
+    corners = rectangle(length, width)
     return Prism(corners, height, fitting_bevel(corners, height))
 
 

@@ -135,12 +135,8 @@ class MeshObject(ObjectModel):
     def height_at(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:
         """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
         triangles = self.vertices[self.faces]
-        origin, side_a, side_b = (
-            triangles[:, 0],
-            triangles[:, 1] - triangles[:, 0],
-            triangles[:, 2] - triangles[:, 0],
-        )
-        normals = np.cross(side_a, side_b)
+        origin, second, third = np.moveaxis(triangles, 1, 0)
+        normals = np.cross(second - origin, third - origin)
         facing_up = normals[:, 2] > 1e-12
         origin, normals = origin[facing_up], normals[facing_up]
         tree = shapely.STRtree(flat_polygons(triangles[facing_up]))
@@ -150,22 +146,6 @@ class MeshObject(ObjectModel):
         surface = np.zeros(len(points))
         np.maximum.at(surface, index, heights)
         return surface
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything needed to make the object again, as plain JSON values."""
-        return {
-            "kind": self.kind,
-            "vertices": self.vertices.tolist(),
-            "faces": self.faces.tolist(),
-            "bevel": [self.bevel.width, self.bevel.height],
-        }
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "MeshObject":
-        """The object that ``to_dict`` described."""
-        return cls(
-            np.array(values["vertices"]), np.array(values["faces"], dtype=np.int64), Bevel(*values["bevel"])
-        )
 
     @cached_property
     def _mesh(self) -> Any:

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from inspect import signature
 from typing import Any, ClassVar
 
 import numpy as np
@@ -55,7 +56,7 @@ class MassProperties:
     """Inertia about the centre of mass, along the object's axes [kg m^2]."""
 
     def scaled(self, factor: float) -> "MassProperties":
-        """The same body, so many times as dense."""
+        """The same body at a multiple of its density."""
         return MassProperties(factor * self.mass, self.com, factor * self.inertia)
 
 
@@ -127,14 +128,19 @@ class ObjectModel(ABC):
     def height_at(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:
         """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
 
-    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
-        """``kind``, and everything needed to make the object again, as plain JSON values."""
+        """``kind`` and the constructor's arguments, which the object keeps under their names, as plain JSON values."""
+        return {"kind": self.kind} | {
+            name: _plain(getattr(self, name)) for name in signature(type(self)).parameters
+        }
 
     @classmethod
-    @abstractmethod
-    def from_dict(cls, values: dict[str, Any]) -> "ObjectModel":
+    def from_dict(cls, values: Mapping[str, Any]) -> "ObjectModel":
         """The object that ``to_dict`` described."""
+        arguments = {name: values[name] for name in signature(cls).parameters}
+        if "bevel" in arguments:
+            arguments["bevel"] = Bevel(*arguments["bevel"])
+        return cls(**arguments)
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -146,6 +152,12 @@ class ObjectModel(ABC):
         """Largest distance between two corners [m]."""
         return largest_distance(self.corners)
 
+    @cached_property
+    def _polygon(self) -> shapely.Polygon:
+        polygon = shapely.Polygon(self.corners)
+        shapely.prepare(polygon)
+        return polygon
+
 
 def object_from_dict(values: Mapping[str, Any]) -> ObjectModel:
     """The object that ``ObjectModel.to_dict`` described.
@@ -155,10 +167,17 @@ def object_from_dict(values: Mapping[str, Any]) -> ObjectModel:
     """
     family = OBJECTS.find(values.get("kind"))
     try:
-        return family.from_dict(dict(values))
+        return family.from_dict(values)
     except (KeyError, TypeError, ValueError) as error:
         reason = f"is not usable ({error!r}): write it with to_dict"
         raise ShapeError(f"description of a {family.kind} {reason}") from error
+
+
+def _plain(value: Any) -> Any:
+    """A constructor's argument as JSON has it."""
+    if isinstance(value, Bevel):
+        return [value.width, value.height]
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def largest_distance(points: Float[np.ndarray, "n 2"]) -> float:
@@ -186,7 +205,7 @@ def inner_radius(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def fitting_bevel(corners: Float[np.ndarray, "n 2"], height: float) -> Bevel:
-    """The usual bevel, scaled down to what a slender or flat object bears.
+    """The default bevel, scaled down to what a slender or flat object bears.
 
     Its width is at most half the radius of the widest circle inside the outline, its height at most half
     the object's.
@@ -196,7 +215,7 @@ def fitting_bevel(corners: Float[np.ndarray, "n 2"], height: float) -> Bevel:
 
 
 def read_only(values: Any, dtype: type = float) -> np.ndarray:
-    """A copy of an array that nobody can change."""
+    """A read-only copy of an array."""
     array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array

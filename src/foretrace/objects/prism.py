@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import shapely
@@ -133,29 +132,9 @@ class Prism(ObjectModel):
         """Height of the upper surface [m] above points given in the object frame [m]; 0 beside the object."""
         return np.where(shapely.intersects_xy(self._polygon, points[:, 0], points[:, 1]), self.height, 0.0)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything needed to make the prism again, as plain JSON values."""
-        return {
-            "kind": self.kind,
-            "corners": self.corners.tolist(),
-            "height": self.height,
-            "bevel": [self.bevel.width, self.bevel.height],
-        }
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Prism":
-        """The prism that ``to_dict`` described."""
-        return cls(values["corners"], values["height"], Bevel(*values["bevel"]))
-
     @cached_property
     def _unit_mass_properties(self) -> MassProperties:
         return convex_mass_properties(self._pieces, density=1.0)
-
-    @cached_property
-    def _polygon(self) -> shapely.Polygon:
-        polygon = shapely.Polygon(self.corners)
-        shapely.prepare(polygon)
-        return polygon
 
     @cached_property
     def _bottom(self) -> shapely.Geometry:
@@ -278,9 +257,7 @@ def convex_parts(corners: Float[np.ndarray, "n 2"]) -> list[list[int]]:
     triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(corners)).geoms
     parts: list[list[int]] = []
     for triangle in triangles:
-        indices = [
-            index_of[xy] for xy in shapely.get_coordinates(triangle)[:3].tolist() for xy in [tuple(xy)]
-        ]
+        indices = [index_of[x, y] for x, y in shapely.get_coordinates(triangle)[:3].tolist()]
         parts.append(indices if polygon_area(corners[indices]) > 0 else indices[::-1])
     owner = {edge: part for part in parts for edge in directed_edges(part)}
     diagonals = [edge for edge in owner if edge[0] < edge[1] and edge[::-1] in owner]

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import shapely
@@ -54,21 +53,6 @@ class Box(Prism):
         object.__setattr__(self, "width", float(width))
         object.__setattr__(self, "depth", float(depth))
         super().__init__(corners, height, fitting_bevel(corners, height) if bevel is None else bevel)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything needed to make the box again, as plain JSON values."""
-        return {
-            "kind": self.kind,
-            "width": self.width,
-            "depth": self.depth,
-            "height": self.height,
-            "bevel": [self.bevel.width, self.bevel.height],
-        }
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Box":
-        """The box that ``to_dict`` described."""
-        return cls(values["width"], values["depth"], values["height"], Bevel(*values["bevel"]))
 
     def _parts(self) -> list[tuple[np.ndarray, range | list[int]]]:
         """One convex part: a block needs no wedges."""
@@ -130,21 +114,6 @@ class Cylinder(ObjectModel):
         inside = shapely.intersects_xy(self._polygon, points[:, 0], points[:, 1])
         bulge = np.sqrt(np.maximum(self.radius**2 - points[:, 1] ** 2, 0.0))
         return np.where(inside, self.radius + bulge, 0.0)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything needed to make the cylinder again, as plain JSON values."""
-        return {"kind": self.kind, "radius": self.radius, "length": self.length}
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Cylinder":
-        """The cylinder that ``to_dict`` described."""
-        return cls(values["radius"], values["length"])
-
-    @cached_property
-    def _polygon(self) -> shapely.Polygon:
-        polygon = shapely.Polygon(self.corners)
-        shapely.prepare(polygon)
-        return polygon
 
     @cached_property
     def _bar(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from foretrace.errors import TrainingError
 from foretrace.features import Precision
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes
 from foretrace.imagined.domain import Ranges, find_unusual
-from foretrace.interactions.candidates import Candidates
+from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.config import PredictorConfig

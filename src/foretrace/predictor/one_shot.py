@@ -11,7 +11,9 @@ from torch import Tensor
 
 from foretrace.errors import TrainingError
 from foretrace.features import Outline
-from foretrace.features.outline import HEIGHT_CELLS, MAX_CORNERS, UNIT
+from foretrace.features.base import UNIT
+from foretrace.features.hull import MAX_CORNERS
+from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.imagined import LEVELS, Futures, ImaginedBatch, conformal_scores, quantiles_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor.base import EffectPredictor
@@ -21,9 +23,8 @@ from foretrace.predictor.mixture import COORDINATES, TURN_LENGTH, Mixture, along
 from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
 from foretrace.predictor.states import Effects, decode_poses
 from foretrace.predictor.traced import TracedDistribution
+from foretrace.predictor.trajectory_basis import find_basis, fit_covariance
 
-ODD = (1, 3, 5)
-"""Coordinates of a motion that change their sign in a mirror: along the edge; turns about the other two axes."""
 TURN_WEIGHT = 0.5
 """Weight of the turn in the loss, beside 1 for the displacement."""
 TEMPERATURE = 0.003
@@ -32,8 +33,6 @@ SCALE_WEIGHT = 0.02
 """Weight of the predicted error scale's own loss."""
 SAME = 0.01
 """A value relative to edges that varies by less (a millimetre, half a degree) counts as constant."""
-FEW = 10
-"""Lever-ups of an outcome from which on its residuals' size is estimated from them."""
 LARGEST_ERROR = 1.5
 """Logarithm of the largest error scale, in units of the position's: outputs for improbable futures are arbitrary."""
 DISAGREEMENT = 8.0
@@ -135,11 +134,8 @@ class OneShotPredictor(EffectPredictor):
                 "features 'outline'"
             )
         self.heights = self.features.heights
-        numbers, outcomes, components = (
-            NUM_VALUES + self.heights * PROBES**2,
-            len(self.outcomes),
-            config.components,
-        )
+        numbers, outcomes = NUM_VALUES + self.heights * PROBES**2, len(self.outcomes)
+        components = config.components
         widths = (config.hidden,) * config.layers
         self.networks = Ensemble(
             config.ensemble, (numbers + len(self.context), *widths, outcomes * (components + 2))
@@ -169,8 +165,7 @@ class OneShotPredictor(EffectPredictor):
     def prepare(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
         """Find the PCA basis of the training part's trajectories, and the scale of values relative to edges.
 
-        A shorter trajectory counts as if it stayed where it ends. Components are found separately for the coordinates
-        that stay the same in a mirror and those that change their sign: each is its own mirror image, up to its sign.
+        A shorter trajectory counts as if it stayed where it ends.
         """
         features, effects = _some(features, effects)
         edges = self._find_edges(features, self._com(effects.states))
@@ -180,19 +175,10 @@ class OneShotPredictor(EffectPredictor):
         scale = values.std(dim=0, correction=0)
         # A value that is nearly constant tells nothing apart, and must not blow up where it is not: it is shifted.
         self.value_scale.copy_(torch.where(scale < SAME, 1.0, scale))
-        odd = torch.isin(torch.arange(COORDINATES), torch.tensor(ODD)).to(moved)
-        self.mean_motion.copy_(moved.mean(dim=0) * (1 - odd))
-        found = []
-        for parity, part in ((1.0, 1 - odd), (-1.0, odd)):
-            deviation = ((moved - self.mean_motion) * part).flatten(1)
-            _, sizes, directions = torch.linalg.svd(deviation, full_matrices=False)
-            found += [
-                (float(s), parity, d) for s, d in zip(sizes / len(moved) ** 0.5, directions, strict=True)
-            ]
-        found.sort(key=lambda component: -component[0])
-        for k, (size, parity, direction) in enumerate(found[: len(self.motions)]):
-            self.motions[k] = size * direction.view_as(self.mean_motion)
-            self.parity[k] = parity
+        mean, components, parity = find_basis(moved, len(self.motions))
+        self.mean_motion.copy_(mean)
+        self.motions[: len(components)] = components
+        self.parity[: len(parity)] = parity
 
     def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
         """Negative log-likelihood of the observed motions, in units of the normalised position.
@@ -237,30 +223,16 @@ class OneShotPredictor(EffectPredictor):
         other_features: Float[Tensor, "other inputs"],
         other_effects: Effects,
     ) -> None:
-        """Estimate the covariance of normalised residuals and the widths of prediction regions.
-
-        Correlations are those of the training part. The residuals' size is that of the validation part, and so are the
-        widths of regions (split-conformal prediction).
-        """
+        """Estimate the covariance of normalised residuals, and the widths of prediction regions (split-conformal)."""
         features, effects = _some(features, effects)
         residuals, other_residuals = (
             torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
             for part in ((features, effects), (other_features, other_effects))
         )
         for outcome in range(len(self.outcomes)):
-            mine, others = (
-                residuals[effects.outcomes == outcome],
-                other_residuals[other_effects.outcomes == outcome],
-            )
-            mine = mine if len(mine) else residuals
-            covariance = mine.mT @ mine / len(mine)
-            ridge = 1e-3 * covariance.diagonal().mean() + 1e-12
-            covariance = covariance + ridge * torch.eye(len(covariance)).to(covariance)
-            if len(others) >= FEW:
-                root = torch.linalg.cholesky(covariance)
-                white = torch.linalg.solve_triangular(root, others.mT, upper=False)
-                covariance = covariance * white.square().mean()
-            self.covariance[outcome] = covariance
+            mine = residuals[effects.outcomes == outcome]
+            others = other_residuals[other_effects.outcomes == outcome]
+            self.covariance[outcome] = fit_covariance(mine if len(mine) else residuals, others)
         scores = [self._scores(*piece) for piece in _pieces(other_features, other_effects)]
         self.quantiles.copy_(torch.from_numpy(quantiles_of(np.concatenate(scores))))
 

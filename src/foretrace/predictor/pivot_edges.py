@@ -12,12 +12,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from foretrace.features.base import UNIT
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.objects import BEVEL
 
-UNIT = 0.1
-"""Lengths are divided by this to be of unit scale [m]."""
 NEAR_CORNER = 0.01
 """Distance from a corner within which the place where the ray leaves the hull is described in more detail [m]."""
 AT_CORNER = 0.003
@@ -85,13 +84,6 @@ def find_pivot_edges(
         values = torch.cat([values, torch.stack([probed, probed.flip(-1)], dim=1).flatten(3)], dim=-1)
     # A vector out of the object or up stays so in the mirror; along the edge it is reversed.
     return PivotEdges(values, torch.stack([axes, axes * axes.new_tensor(MIRROR)[:, None]], dim=1), ends)
-
-
-def mirror_corners(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, "batch corners 2"]:
-    """The hulls of `find_pivot_edges` seen in a mirror along the action axis, counter-clockwise again."""
-    number, count = torch.arange(corners.shape[1], device=corners.device), _Hull(corners).count[:, None]
-    order = torch.where(number < count, -number % count, 0)
-    return corners.gather(1, order[..., None].expand(-1, -1, 2)) * corners.new_tensor(MIRROR[:2])
 
 
 class _Hull:

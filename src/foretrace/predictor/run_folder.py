@@ -43,9 +43,13 @@ from foretrace.predictor.checkpoint import (
 ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
 SPLIT = "split.json"
+FINGERPRINTS = "fingerprints"
+"""Entry of the split with a fingerprint of each part."""
 RESUME = "resume.safetensors"
 TENSORBOARD = "tensorboard"
 
+Source = InteractionBatch | Dataset
+"""Interactions in memory or on disk."""
 Row = dict[str, int | float]
 """The metrics of one epoch, by name."""
 
@@ -142,12 +146,12 @@ class RunFolder:
         }
         write_json(self.path / ENVIRONMENT, {**facts, "commit": git_commit(), "versions": versions})
 
-    def write_split(self, source: InteractionBatch | Dataset, split: Split) -> None:
+    def write_split(self, source: Source, split: Split) -> None:
         """Note the ids of the interactions in each part, and what they were."""
         parts, ids = asdict(split).items(), source.ids
         content = {part: ids[rows].tolist() for part, rows in parts}
         prints = {part: fingerprint(source[np.sort(rows)]) for part, rows in parts}
-        write_json(self.path / SPLIT, {**content, "fingerprints": prints})
+        write_json(self.path / SPLIT, {**content, FINGERPRINTS: prints})
 
     def save(self, progress: Progress, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> None:
         """Note the end of an epoch; the model itself too if the epoch is the best so far."""
@@ -208,35 +212,34 @@ class RunFolder:
         (self.path / RESUME).unlink(missing_ok=True)
 
 
-Source = InteractionBatch | Dataset
-
-
-def fingerprint(source: InteractionBatch | Dataset, context: Sequence[str] = ()) -> str:
+def fingerprint(source: Source, context: Sequence[str] = ()) -> str:
     """A short hash of everything in interactions that a training can read, and of the context it is conditioned on."""
     return short_hash(_contents(source, context))
 
 
-def _contents(source: InteractionBatch | Dataset, context: Sequence[str]) -> Iterator[bytes]:
+def _contents(source: Source, context: Sequence[str]) -> Iterator[bytes]:
     """The same bytes of a batch and of a data set, which is gone through for each of the large arrays."""
     small: dict[str, list[np.ndarray]] = {}
     yield np.ascontiguousarray(source.ids).tobytes()
-    for name in ("mask", "height", "times", "com", "pose"):
-        if name == "times":
-            yield np.ascontiguousarray(source.times).tobytes()
-            continue
+    for batch in source.batches():
+        yield np.ascontiguousarray(batch.mask).tobytes()
+        for name in ("length", "slip_index", "support_points", "outcome"):
+            small.setdefault(name, []).append(getattr(batch, name))
+        for name in context:
+            small.setdefault(f"context {name}", []).append(column_of(batch, name))
+    for batch in source.batches():
+        yield np.ascontiguousarray(batch.height).tobytes()
+    yield np.ascontiguousarray(source.times).tobytes()
+    for name in ("com", "pose"):
         for batch in source.batches():
             yield np.ascontiguousarray(getattr(batch, name)).tobytes()
-            if name == "mask":
-                for column in ("length", "slip_index", "support_points", "outcome"):
-                    small.setdefault(column, []).append(getattr(batch, column))
-                for column in context:
-                    small.setdefault(f"context {column}", []).append(column_of(batch, column))
-    joined = {name: np.concatenate(parts) for name, parts in small.items()}
-    for name in ("length", "slip_index", "support_points"):
-        yield np.ascontiguousarray(joined[name]).tobytes()
-    yield "\n".join(joined["outcome"].tolist()).encode()
-    for name in context:
-        yield np.ascontiguousarray(joined[f"context {name}"]).tobytes()
+    for name, parts in small.items():
+        values = np.concatenate(parts)
+        yield (
+            "\n".join(values.tolist()).encode()
+            if name == "outcome"
+            else np.ascontiguousarray(values).tobytes()
+        )
 
 
 def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
@@ -246,17 +249,15 @@ def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
         run: Folder of the training.
         data: All of the data set.
     """
-    file = Path(run) / SPLIT
-    if not file.is_file():
-        return {}
-    names = [name for name in json.loads(file.read_text(encoding="utf-8")) if name != "fingerprints"]
     try:
-        return {name: _rows_of(run, data, name).ids.tolist() for name in names}
+        return {
+            name: _rows_of(run, data, name).ids.tolist() for name in _read_split(run) if name != FINGERPRINTS
+        }
     except (DatasetError, TrainingError):
         return {}
 
 
-def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test") -> InteractionBatch:
+def part_of(run: str | Path, data: Source, part: str = "test") -> InteractionBatch:
     """The interactions that were one part of a training's split.
 
     Args:
@@ -273,13 +274,10 @@ def part_of(run: str | Path, data: InteractionBatch | Dataset, part: str = "test
 
 def _rows_of(run: str | Path, data: Source, part: str) -> Source:
     """The interactions that were one part of a training's split, and are still the same."""
-    file = Path(run) / SPLIT
-    if not file.is_file():
-        raise TrainingError(f"{file} is missing: {run} is not the folder of a training")
-    parts = json.loads(file.read_text(encoding="utf-8"))
-    prints = parts.pop("fingerprints")
-    if part not in parts:
-        raise TrainingError(f"{file} has no part {part!r}; it has: {', '.join(parts)}")
+    parts = _read_split(run)
+    prints = parts.pop(FINGERPRINTS, {})
+    if part not in parts or part not in prints:
+        raise TrainingError(f"{Path(run) / SPLIT} has no part {part!r}; it has: {', '.join(parts)}")
     rows = np.flatnonzero(np.isin(data.ids, parts[part]))
     _ = data.times  # those of the whole from here on, even if the part's longest trajectory is shorter
     if len(rows) != len(parts[part]):
@@ -294,6 +292,10 @@ def _rows_of(run: str | Path, data: Source, part: str) -> Source:
             "give the data set that it was trained on"
         )
     return found
+
+
+def _read_split(run: str | Path) -> dict[str, Any]:
+    return read_json(Path(run) / SPLIT, TrainingError, "give the folder of a training")
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

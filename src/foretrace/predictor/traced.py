@@ -8,7 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features.outline import HEIGHT_CELLS, MAX_CORNERS, UNIT
+from foretrace.features.base import UNIT
+from foretrace.features.hull import MAX_CORNERS
+from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.geometry import quaternion_to_matrix, rotation_from_6d
 from foretrace.imagined import FLOOR, LEVELS
 from foretrace.imagined.context import CONTEXT

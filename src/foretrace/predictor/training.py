@@ -3,10 +3,9 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,66 +15,28 @@ from foretrace.errors import TrainingError
 from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
 from foretrace.files import short_hash
-from foretrace.imagined.context import recorded_context
-from foretrace.imagined.domain import measure, ranges_of
+from foretrace.imagined.domain import ranges_of
 from foretrace.interactions.dataset import Dataset, InteractionBatch, count_outcomes
 from foretrace.interactions.record import Outcome
-from foretrace.interactions.splits import Split, split_by_seed
+from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
 from foretrace.predictor.config import PredictorConfig, TrainConfig
 from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.optimizer import make_optimizer
-from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, fingerprint
+from foretrace.predictor.parts import Part, choose_split, outcome_of, prepare
+from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, Source, fingerprint
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
-from foretrace.predictor.states import Effects, state_statistics, valid_lengths
+from foretrace.predictor.states import Effects, state_statistics
 from foretrace.trajectories import final_distance, mean_distance
 
 RUNTIME = ("device", "threads", "precision")
 """Settings that say where a training runs, not what it ends with."""
 
-
-Source = InteractionBatch | Dataset
 PIECE = 2048
 """Rows that are normalised or imagined together."""
-MEASURE = "measure "
 IN_MEMORY = 4_000
 """A data set of more interactions is prepared piece by piece: it need not fit into memory."""
-LARGE = 20_000
-"""States of a part of more interactions are kept in single precision, and features take the place of their inputs."""
-
-
-@dataclass
-class _Part:
-    """One part of the data, ready to learn from."""
-
-    source: Source
-    """Its interactions."""
-    inputs: Tensor
-    """Inputs of the features; in a large part the features may take their place."""
-    context: np.ndarray
-    """(batch, context) values that the predictor is conditioned on [SI]."""
-    states: np.ndarray
-    """(batch, time, state) in the action frame [m], zeros past the length; float32 in a large part."""
-    lengths: np.ndarray
-    """(batch,) samples of each trajectory that count."""
-    outcomes: np.ndarray
-    """(batch,) numbers of the outcomes that the predictor distinguishes."""
-    measures: dict[str, np.ndarray]
-    """(batch,) measures by which objects are compared."""
-
-    def __len__(self) -> int:
-        return len(self.lengths)
-
-    @property
-    def large(self) -> bool:
-        """Whether there is room for one copy of it only."""
-        return self.states.dtype == np.float32
-
-    @property
-    def valid(self) -> np.ndarray:
-        """(batch, time) bool: the samples that count."""
-        return np.arange(self.states.shape[1]) < self.lengths[:, None]
 
 
 def fit_predictor(
@@ -109,10 +70,10 @@ def fit_predictor(
     """
     training = _loop_settings(predictor, training)
     with _made(predictor, training, batch, training.threads) as made:
-        made.learned_from = _outcomes_of(batch.outcome[split.train])
+        made.learned_from = _outcomes_of(batch, split)
         inputs = made.features.inputs(batch) if inputs is None else inputs
         train, validation = (
-            _prepare(batch[rows], made, inputs[rows]) for rows in (split.train, split.validation)
+            prepare(batch[rows], made, inputs[rows]) for rows in (split.train, split.validation)
         )
         progress = _Training(training, made, _Memory(), train, validation, fitted).run(report)
     return made.eval(), progress
@@ -157,11 +118,13 @@ def train_predictor(
     threads = training.threads or (folder.threads if resume else None)
     with _made(predictor, training, source, threads) as made:
         training = replace(training, outcomes=training.outcomes or made.outcomes or (str(Outcome.LEVERED),))
-        outcomes, lengths = _overview(source)
-        split = _choose_split(outcomes, lengths, training) if split is None else split
-        made.learned_from = _outcomes_of(outcomes[split.train])
+        split = choose_split(source, training) if split is None else split
+        made.learned_from = _outcomes_of(source, split)
         described = {name: value for name, value in asdict(training).items() if name not in RUNTIME}
-        described |= {"data": fingerprint(source, made.context), "rows": _hash_split(split)}
+        described |= {
+            "data": fingerprint(source, made.context),
+            "rows": short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()]),
+        }
         folder.start(made, described, resume)
         if folder.finished:
             return folder.path
@@ -170,7 +133,7 @@ def train_predictor(
             {"seed": training.seed, "data": described["data"], "device": str(made.device)}
             | {"precision": made.features.precision, "threads": torch.get_num_threads()}
         )
-        train, validation = (_prepare(source[rows], made) for rows in (split.train, split.validation))
+        train, validation = (prepare(source[rows], made) for rows in (split.train, split.validation))
         with (
             terminal(training.num_epochs(len(split.train)), progress) as (report, show),
             tensorboard(folder.path / TENSORBOARD) as log,
@@ -211,8 +174,8 @@ class _Training:
         config: TrainConfig,
         predictor: EffectPredictor,
         keeper: RunFolder | _Memory,
-        train: _Part,
-        validation: _Part,
+        train: Part,
+        validation: Part,
         fitted: Path | None = None,
     ):
         self.config, self.predictor, self.keeper, self.fitted = config, predictor, keeper, fitted
@@ -222,7 +185,6 @@ class _Training:
         predictor.set_normalisation(mean, scale, train.source.times)
         predictor.set_context(train.context)
         self.effects = self._effects_of(train, in_place=train.large)
-        self._fixed: tuple[Tensor, Tensor] | None = None
         self.optimizer = make_optimizer(predictor)
 
     def run(
@@ -236,13 +198,12 @@ class _Training:
             done = Progress()
             self._fit_features(report)
             with torch.no_grad():
-                self.predictor.prepare(self._features()[0], self.effects)
+                self.predictor.prepare(self._features_of(self.train), self.effects)
             self.keeper.save(done, self.predictor, self.optimizer)
-        fixed, fixed_validation = (None, None) if self.predictor.features.trainable else self._features()
         while done.epoch < self.epochs:
             started = perf_counter()
-            row = {"epoch": done.epoch + 1, "train_loss": self._epoch(done.epoch + 1, fixed)}
-            row |= self._validate(fixed_validation)
+            row = {"epoch": done.epoch + 1, "train_loss": self._epoch(done.epoch + 1)}
+            row |= self._validate()
             row |= {
                 "learning_rate": self.optimizer.param_groups[0]["lr"],
                 "seconds": perf_counter() - started,
@@ -252,7 +213,7 @@ class _Training:
             show(row, done)
         self.predictor.load_state_dict(self.keeper.model)
         with torch.no_grad():
-            features, other_features = self._features()
+            features, other_features = self._features_of(self.train), self._features_of(self.validation)
             other_effects = self._effects_of(self.validation)
             self.predictor.finish(features, self.effects, other_features, other_effects)
         self.keeper.finish(self.predictor)
@@ -276,7 +237,7 @@ class _Training:
             self.fitted.mkdir(parents=True, exist_ok=True)
             write_tensors(file, features.state_dict())
 
-    def _effects_of(self, part: _Part, in_place: bool = False) -> Effects:
+    def _effects_of(self, part: Part, in_place: bool = False) -> Effects:
         """Normalised states; in place of those in metres where there is no room for both."""
         predictor, valid = self.predictor, torch.from_numpy(part.valid)
         if in_place:
@@ -291,25 +252,22 @@ class _Training:
         )
         return Effects(states, lengths, outcomes)
 
-    def _features(self) -> tuple[Tensor, Tensor]:
-        """Features and context of training and validation part; computed once if the extractor does not train."""
-        if self._fixed is not None:
-            return self._fixed
-        features = (self._features_of(self.train), self._features_of(self.validation))
-        if not self.predictor.features.trainable:
-            self._fixed = features
+    def _features_of(self, part: Part) -> Tensor:
+        """Features and context of a part; computed once if the extractor is not trained with the predictor."""
+        if part.features is not None:
+            return part.features
+        fixed = not self.predictor.features.trainable
+        features = self.predictor.compute_features(part.inputs, in_place=part.large and fixed)
+        features = self.predictor.add_context(features, part.context)
+        if fixed:
+            part.features = features
         return features
 
-    def _features_of(self, part: _Part) -> Tensor:
-        features = self.predictor.compute_features(
-            part.inputs, in_place=part.large and not self.predictor.features.trainable
-        )
-        return self.predictor.add_context(features, part.context)
-
-    def _epoch(self, epoch: int, fixed: Tensor | None) -> float:
-        """One pass over the training part; the mean loss. ``fixed`` are features that do not change."""
+    def _epoch(self, epoch: int) -> float:
+        """One pass over the training part; the mean loss."""
         predictor, optimizer, device = self.predictor, self.optimizer, self.predictor.device
         order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.effects))
+        fixed = None if predictor.features.trainable else self._features_of(self.train)
         total = torch.zeros((), device=device)
         predictor.train()
         with seeded(self.config.seed, epoch, device):
@@ -336,10 +294,10 @@ class _Training:
             )
         return mean
 
-    def _validate(self, fixed: Tensor | None) -> Row:
+    def _validate(self) -> Row:
         """Errors of the whole roll-out from the first state alone."""
         part, predictor = self.validation, self.predictor
-        features = self._features_of(part) if fixed is None else fixed
+        features = self._features_of(part)
         pieces = zip(
             features.split(PIECE), np.split(part.states[:, 0], range(PIECE, len(part), PIECE)), strict=True
         )
@@ -353,6 +311,11 @@ class _Training:
         }
 
 
+def _outcomes_of(source: Source, split: Split) -> tuple[str, ...]:
+    """Outcomes that occur in the training part, in the order in which actions name them."""
+    return tuple(count_outcomes(outcome_of(source)[split.train].tolist()))
+
+
 def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: TrainConfig | None) -> TrainConfig:
     for name, value, kinds in (
         ("predictor", predictor, (PredictorConfig, EffectPredictor)),
@@ -363,76 +326,6 @@ def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: Train
             raise TrainingError(f"{name} is a {type(value).__name__}: give a {wanted}")
     config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
     return config.training if training is None else training
-
-
-def _outcomes_of(outcomes: np.ndarray) -> tuple[str, ...]:
-    """Outcomes that occur, in the order in which actions name them."""
-    return tuple(count_outcomes(outcomes.tolist()))
-
-
-def _overview(source: Source) -> tuple[np.ndarray, np.ndarray]:
-    """Outcome of each interaction, and the number of its samples up to where the object slipped."""
-    if isinstance(source, InteractionBatch):
-        return source.outcome, valid_lengths(source)
-    slips = source.index["slip_index"].fill_null(np.iinfo(np.int64).max).to_numpy()
-    return np.array(source.index["outcome"].to_pylist()), np.minimum(source.lengths, slips)
-
-
-def _choose_split(outcome: np.ndarray, lengths: np.ndarray, training: TrainConfig) -> Split:
-    outcomes = training.outcomes or ()
-    usable = np.flatnonzero(np.isin(outcome, outcomes) & (lengths >= 2))
-    if len(usable) == 0:
-        present = ", ".join(np.unique(outcome).tolist()) or "none"
-        raise TrainingError(
-            f"no interaction has an outcome among {', '.join(outcomes)}; the data has: {present}"
-        )
-    drawn = split_by_seed(len(usable), training.seed, training.split)
-    return Split(usable[drawn.train], usable[drawn.validation], usable[drawn.test])
-
-
-def _hash_split(split: Split) -> str:
-    return short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()])
-
-
-def _prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = None) -> _Part:
-    if isinstance(source, Dataset):
-        return _prepare_in_pieces(source, predictor)
-    inputs = predictor.features.inputs(source) if inputs is None else inputs
-    return _Part(
-        source=source,
-        inputs=inputs,
-        context=recorded_context(source, predictor.context),
-        states=predictor.encode(source),
-        lengths=predictor.lengths(source),
-        outcomes=predictor.number_outcomes(source),
-        measures=measure(source, source.com[:, 0]) | predictor.features.measure(inputs),
-    )
-
-
-def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> _Part:
-    """The same of a data set that need not fit into memory."""
-    whole: dict[str, Any] = {}
-    done = 0
-    for batch in source.batches():
-        piece = _prepare(batch, predictor)
-        columns = {
-            "inputs": piece.inputs.numpy(),
-            "context": piece.context,
-            "states": piece.states.astype(np.float32 if len(source) > LARGE else np.float64),
-            "lengths": piece.lengths,
-            "outcomes": piece.outcomes,
-            **{MEASURE + name: values for name, values in piece.measures.items()},
-        }
-        for name, values in columns.items():
-            column = whole.setdefault(name, np.empty((len(source), *values.shape[1:]), values.dtype))
-            column[done : done + len(batch)] = values
-        done += len(batch)
-    measures = {
-        name.removeprefix(MEASURE): values for name, values in whole.items() if name.startswith(MEASURE)
-    }
-    rest = {name: values for name, values in whole.items() if not name.startswith(MEASURE)}
-    rest["inputs"] = torch.from_numpy(rest["inputs"])
-    return _Part(source, measures=measures, **rest)
 
 
 @contextmanager

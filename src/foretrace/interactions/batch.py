@@ -1,0 +1,236 @@
+"""Interactions in memory as arrays, and several actions on one object."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Float, Int
+
+from foretrace.actions import Action, action_transform
+from foretrace.errors import DatasetError
+from foretrace.interactions import storage
+from foretrace.interactions.record import Interaction
+from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
+from foretrace.objects import ObjectModel
+
+
+@dataclass(frozen=True)
+class InteractionBatch:
+    """Many interactions as arrays, in the action frame; what every feature and predictor reads."""
+
+    ids: Int[np.ndarray, " batch"]
+    """Number of each interaction within its data set."""
+    mask: Bool[np.ndarray, "batch 128 128"]
+    """Top-down masks."""
+    height: Float[np.ndarray, "batch 128 128"]
+    """Top-down height maps [m], 0 outside the object."""
+    corners: Float[np.ndarray, "batch corners 2"]
+    """Corners of each object in the action frame at rest [m], counter-clockwise, NaN-padded."""
+    num_corners: Int[np.ndarray, " batch"]
+    """How many of them each object has."""
+    object_ids: Int[np.ndarray, " batch"]
+    """Which object was levered: equal numbers are the same object."""
+    times: Float[np.ndarray, " time"]
+    """Sample times [s], common to all."""
+    com: Float[np.ndarray, "batch time 3"]
+    """Centre-of-mass trajectories [m]; NaN past the end of a shorter one."""
+    pose: Float[np.ndarray, "batch time 7"]
+    """Pose trajectories of the object frame: position [m], quaternion (w, x, y, z)."""
+    length: Int[np.ndarray, " batch"]
+    """Number of valid samples of each trajectory."""
+    slip_index: Int[np.ndarray, " batch"]
+    """First sample off the tool after having been lifted; ``length`` where that never happened."""
+    support_points: Float[np.ndarray, "batch 2 2"]
+    """Observed support points in the action frame [m]; NaN where not observed."""
+    outcome: np.ndarray
+    """(batch,) array of outcome names (str)."""
+    parameters: dict[str, np.ndarray]
+    """(batch,) arrays by name [SI]: physical constants as in `Physics`, and parameters of the actions; NaN where an
+    interaction has no such one."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, rows: Any) -> "InteractionBatch":
+        """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all."""
+        kept = {
+            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("times", "parameters")
+        }
+        parameters = {name: values[rows] for name, values in self.parameters.items()}
+        return replace(self, **kept, parameters=parameters)
+
+    def batches(self, size: int | None = None) -> Iterator["InteractionBatch"]:
+        """The same in parts of a number of rows, in order; by default in one."""
+        size = size or max(1, len(self))
+        return (self[start : start + size] for start in range(0, len(self), size))
+
+    @classmethod
+    def from_interactions(cls, interactions: Sequence[Interaction]) -> "InteractionBatch":
+        """Interactions as arrays; objects that are equal get equal ``object_ids``, counted from 0.
+
+        Raises:
+            DatasetError: Two of them were sampled at different times.
+        """
+        descriptions = [json.dumps(interaction.object.to_dict()) for interaction in interactions]
+        numbers = {description: k for k, description in enumerate(dict.fromkeys(descriptions))}
+        rows = [
+            storage.encode(interaction, numbers[description])
+            for interaction, description in zip(interactions, descriptions, strict=True)
+        ]
+        known = dict(zip(descriptions, (interaction.object for interaction in interactions), strict=True))
+        table = storage.to_table(rows)
+        return batch_of(table, known, common_times([table]))
+
+    @classmethod
+    def from_views(
+        cls,
+        views: Sequence[TopDownView],
+        times: Float[np.ndarray, " time"] | None = None,
+        corners: Sequence[Float[np.ndarray, "_ 2"]] | None = None,
+    ) -> "InteractionBatch":
+        """Actions whose effect is still to be imagined: everything that was not observed is NaN, or empty.
+
+        Args:
+            views: What the camera sees of each object, in the action frame.
+            times: Times at which the effect will be imagined [s]; by default none.
+            corners: Corners of each object in the action frame [m], if known.
+        """
+        n, times = len(views), np.zeros(0) if times is None else times
+        corners = [np.zeros((0, 2))] * n if corners is None else corners
+        return cls(
+            ids=np.arange(n),
+            mask=np.array([view.mask for view in views], dtype=bool).reshape(n, VIEW_SIZE, VIEW_SIZE),
+            height=np.array([view.height for view in views], dtype=np.float32).reshape(
+                n, VIEW_SIZE, VIEW_SIZE
+            ),
+            corners=_padded(corners, 2),
+            num_corners=np.array([len(c) for c in corners], dtype=np.int64),
+            object_ids=np.arange(n),
+            times=times,
+            com=np.full((n, len(times), 3), np.nan),
+            pose=np.full((n, len(times), 7), np.nan),
+            length=np.zeros(n, dtype=np.int64),
+            slip_index=np.zeros(n, dtype=np.int64),
+            support_points=np.full((n, 2, 2), np.nan),
+            outcome=_outcome_array([""] * n),
+            parameters={},
+        )
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Several actions on the object of one view."""
+
+    view: TopDownView
+    """The object, in any action frame."""
+    actions: tuple[Action, ...]
+    """The actions, in that frame."""
+
+    @cached_property
+    def contacts(self) -> Float[np.ndarray, "n 2"]:
+        """Contact points in the view's frame [m]."""
+        return np.array([action.contact for action in self.actions])
+
+    @cached_property
+    def directions(self) -> Float[np.ndarray, "n 2"]:
+        """Unit vectors of the actions in the view's frame."""
+        return np.array([action.direction for action in self.actions])
+
+    @property
+    def axes(self) -> Float[np.ndarray, "n 2 2"]:
+        """Rows: x and y axis of each action's frame, in the view's."""
+        return np.stack([self.directions, self.directions[:, ::-1] * [-1, 1]], axis=1)
+
+    def enter(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+        """A point of the view's frame [m] in each action's frame."""
+        inside = np.einsum("nij,nj->ni", self.axes, point[:2] - self.contacts)
+        return np.concatenate([inside, np.full((len(inside), 1), point[2])], axis=1)
+
+    def batch(self) -> InteractionBatch:
+        """The object as seen in each action's frame."""
+        return InteractionBatch.from_views([self.view.seen_from(action) for action in self.actions])
+
+
+def common_times(tables: Iterable[pa.Table]) -> Float[np.ndarray, " time"]:
+    """Sample times [s] of the longest interaction in some tables, with which all others agree.
+
+    Raises:
+        DatasetError: Two of them were sampled at different times.
+    """
+    found: dict[bytes, tuple[int, np.ndarray]] = {}  # an interaction of each kind of times
+    for table in tables:
+        for id, row in zip(table["id"].to_pylist(), _lists(table, "times", 1), strict=True):
+            found.setdefault(row.tobytes(), (id, row[:, 0].copy()))
+    longest = max((row for _, row in found.values()), key=len, default=np.zeros(0))
+    for id, row in found.values():
+        if not np.allclose(row, longest[: len(row)], rtol=0, atol=1e-9):
+            raise DatasetError(f"interaction {id} was sampled at other times than the rest; batch it apart")
+    return longest
+
+
+def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndarray) -> InteractionBatch:
+    """Stored interactions as arrays.
+
+    Args:
+        table: Their rows.
+        objects: The objects by their descriptions.
+        times: Their `common_times` [s].
+    """
+    length = np.diff(table["times"].combine_chunks().offsets.to_numpy()).astype(np.int64)
+    corners = _corners_in_action(table, objects)
+    slip_index = table["slip_index"].to_numpy()
+    constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
+    return InteractionBatch(
+        ids=table["id"].to_numpy(),
+        mask=storage.unpack_masks(table["mask"].to_pylist()),
+        height=storage.unpack_heights(table["height"].to_pylist()),
+        corners=_padded(corners, 2),
+        num_corners=np.array([len(c) for c in corners], dtype=np.int64),
+        object_ids=table["object_id"].to_numpy(),
+        times=times,
+        com=_padded(_lists(table, "com_trajectory", 3), 3, len(times)),
+        pose=_padded(_lists(table, "pose_trajectory", 7), 7, len(times)),
+        length=length,
+        slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
+        support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
+        outcome=_outcome_array(table["outcome"].to_pylist()),
+        parameters=constants | storage.parameter_values(table),
+    )
+
+
+def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:
+    """Each object's corners in its action's frame at rest [m]."""
+    corners = []
+    columns = (table[name].to_pylist() for name in ("object", "contact", "direction"))
+    for description, contact, direction in zip(*columns, strict=True):
+        unit = np.array(direction)
+        # Dividing by a length of almost 1 again keeps features as they have always been, to the last bit.
+        T_action_object = action_transform(np.array(contact), unit / np.linalg.norm(unit))
+        corners.append(objects[description].corners @ T_action_object[:2, :2].T + T_action_object[:2, 3])
+    return corners
+
+
+def _outcome_array(outcomes: Sequence[str]) -> np.ndarray:
+    """Names as an array whose width, and so its bytes, does not depend on which of a lever-up's outcomes occur."""
+    return np.array(outcomes, dtype=f"<U{max(8, *map(len, outcomes), 0)}")
+
+
+def _padded(arrays: Sequence[np.ndarray], width: int, longest: int | None = None) -> np.ndarray:
+    """(n, longest, width) from arrays of (k, width), NaN past the end of each."""
+    longest = max((len(a) for a in arrays), default=0) if longest is None else longest
+    padded = np.full((len(arrays), longest, width), np.nan)
+    for k, array in enumerate(arrays):
+        padded[k, : len(array)] = array
+    return padded
+
+
+def _lists(table: pa.Table, name: str, width: int) -> list[np.ndarray]:
+    """A list column as one (k, width) array per row, without a copy."""
+    column = table[name].combine_chunks()
+    flat, offsets = column.values.to_numpy(zero_copy_only=False), column.offsets.to_numpy()
+    return [flat[a:b].reshape(-1, width) for a, b in pairwise(offsets)]

@@ -1,0 +1,132 @@
+"""Parts of the data, ready to learn from."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from foretrace.errors import TrainingError
+from foretrace.imagined.context import recorded_context
+from foretrace.imagined.domain import measure
+from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.splits import Split, split_by_seed
+from foretrace.predictor.base import EffectPredictor
+from foretrace.predictor.config import TrainConfig
+from foretrace.predictor.run_folder import Source
+from foretrace.predictor.states import valid_lengths
+
+LARGE = 20_000
+"""States of a part of more interactions are kept in single precision, and features take the place of their inputs."""
+
+
+@dataclass
+class Part:
+    """One part of the data, ready to learn from."""
+
+    source: Source
+    """Its interactions."""
+    inputs: Tensor
+    """Inputs of the features; in a large part the features may take their place."""
+    context: np.ndarray
+    """(batch, context) values that the predictor is conditioned on [SI]."""
+    states: np.ndarray
+    """(batch, time, state) in the action frame [m], zeros past the length; float32 in a large part."""
+    lengths: np.ndarray
+    """(batch,) samples of each trajectory that count."""
+    outcomes: np.ndarray
+    """(batch,) numbers of the outcomes that the predictor distinguishes."""
+    measures: dict[str, np.ndarray]
+    """(batch,) measures by which objects are compared."""
+    features: Tensor | None = field(default=None, init=False)
+    """Features and context, once they are computed, of an extractor that is not trained with the predictor."""
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def large(self) -> bool:
+        """Whether there is room for one copy of it only."""
+        return self.states.dtype == np.float32
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(batch, time) bool: the samples that count."""
+        return np.arange(self.states.shape[1]) < self.lengths[:, None]
+
+
+def prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = None) -> Part:
+    """A part of the data for a predictor; of a `Dataset` piece by piece, since it need not fit into memory.
+
+    Args:
+        source: Its interactions.
+        predictor: The predictor.
+        inputs: Inputs of its features, where they are known already.
+    """
+    if isinstance(source, Dataset):
+        return _prepare_in_pieces(source, predictor)
+    inputs = predictor.features.inputs(source) if inputs is None else inputs
+    return Part(
+        source=source,
+        inputs=inputs,
+        context=recorded_context(source, predictor.context),
+        states=predictor.encode(source),
+        lengths=predictor.lengths(source),
+        outcomes=predictor.number_outcomes(source),
+        measures=measure(source, source.com[:, 0]) | predictor.features.measure(inputs),
+    )
+
+
+def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
+    columns: dict[str, np.ndarray] = {}
+    measures: dict[str, np.ndarray] = {}
+    done = 0
+    for batch in source.batches():
+        piece = prepare(batch, predictor)
+        own = {
+            "inputs": piece.inputs.numpy(),
+            "context": piece.context,
+            "states": piece.states.astype(np.float32 if len(source) > LARGE else np.float64),
+            "lengths": piece.lengths,
+            "outcomes": piece.outcomes,
+        }
+        for whole, found in ((columns, own), (measures, piece.measures)):
+            for name, values in found.items():
+                column = whole.setdefault(name, np.empty((len(source), *values.shape[1:]), values.dtype))
+                column[done : done + len(batch)] = values
+        done += len(batch)
+    inputs = torch.from_numpy(columns.pop("inputs"))
+    return Part(source, inputs, measures=measures, **columns)
+
+
+def choose_split(source: Source, training: TrainConfig) -> Split:
+    """Parts drawn by the seed among the interactions that a training may learn from.
+
+    Raises:
+        TrainingError: No interaction has one of its outcomes, or the parts are larger than the data.
+    """
+    outcome, outcomes = outcome_of(source), training.outcomes or ()
+    usable = np.flatnonzero(np.isin(outcome, outcomes) & (_usable_lengths(source) >= 2))
+    if len(usable) == 0:
+        present = ", ".join(np.unique(outcome).tolist()) or "none"
+        raise TrainingError(
+            f"no interaction has an outcome among {', '.join(outcomes)}; the data has: {present}"
+        )
+    drawn = split_by_seed(len(usable), training.seed, training.split)
+    return Split(usable[drawn.train], usable[drawn.validation], usable[drawn.test])
+
+
+def outcome_of(source: Source) -> np.ndarray:
+    """(n,) array of the outcome of each interaction."""
+    if isinstance(source, InteractionBatch):
+        return source.outcome
+    return np.array(source.index["outcome"].to_pylist())
+
+
+def _usable_lengths(source: Source) -> Int[np.ndarray, " n"]:
+    """Samples of each interaction up to where the object slipped."""
+    if isinstance(source, InteractionBatch):
+        return valid_lengths(source)
+    slips = source.index["slip_index"].fill_null(np.iinfo(np.int64).max).to_numpy()
+    return np.minimum(source.lengths, slips)
