@@ -1,8 +1,5 @@
 """Images of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 
 import mujoco
@@ -11,7 +8,7 @@ from jaxtyping import Float, UInt8
 
 from foretrace.actions import Screwdriver
 from foretrace.errors import ExportError, SimulationError
-from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
+from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
 from foretrace.simulation.camera import make_renderer, render
@@ -46,10 +43,7 @@ def camera_pose() -> Float[np.ndarray, "4 4"]:
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = CAMERA_POSITION
-    return pose
+    return rigid_transform(np.column_stack([right, np.cross(forward, right), forward]), CAMERA_POSITION)
 
 
 def render_images(

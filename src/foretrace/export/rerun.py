@@ -15,6 +15,7 @@ from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, Colour, tool_pa
 from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Effect
 from foretrace.objects.surface import triangles_of
+from foretrace.trajectories import interpolate
 
 TIMELINE = "time"
 APPLICATION = "foretrace"
@@ -170,7 +171,7 @@ def distances(
 ) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]:
     """How far the imagined centre of mass is from the observed one [m], at the observed times [s] that both have."""
     common = effect.times[(effect.times >= times[0]) & (effect.times <= times[-1])]
-    there = np.column_stack([np.interp(common, times, axis) for axis in com.T])
+    there = interpolate(times, com, common)
     here = effect.com_trajectory[np.isin(effect.times, common)]
     return common, np.linalg.norm(here - there, axis=1)
 

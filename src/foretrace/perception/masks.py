@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from foretrace.errors import PerceptionError
-from foretrace.geometry import invert_transform
+from foretrace.geometry import invert_transform, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import MINIMAL_HEIGHT
 from foretrace.perception.shadows import Shadow, find_shadow
@@ -300,11 +300,9 @@ def find_table(
         )
     normal = -normal if normal @ middle > 0 else normal  # towards the camera
     along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    T = np.eye(4)
-    T[:3, 0], T[:3, 2] = along / np.linalg.norm(along), normal
-    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
-    T[:3, 3] = normal * (middle @ normal)
-    return invert_transform(T)
+    along /= np.linalg.norm(along)
+    axes = np.column_stack([along, np.cross(normal, along), normal])
+    return invert_transform(rigid_transform(axes, normal * (middle @ normal)))
 
 
 def _fit_plane(points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

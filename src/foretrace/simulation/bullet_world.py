@@ -17,7 +17,13 @@ from scipy.spatial import ConvexHull
 
 from foretrace.actions import Tool
 from foretrace.errors import SimulationError
-from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
+from foretrace.geometry import (
+    invert_transform,
+    matrix_to_pose,
+    pose_to_matrix,
+    rigid_transform,
+    transform_points,
+)
 from foretrace.objects import CollisionShape, CylinderShape, HullShape
 from foretrace.objects.body import Body
 from foretrace.simulation.scene import TABLE_HEIGHT, TABLE_SIZE, TABLE_THICKNESS
@@ -137,8 +143,7 @@ class World:
         """
         inertia, axes = np.linalg.eigh(body.mass.inertia)
         axes[:, 0] *= np.sign(np.linalg.det(axes))
-        frame = np.eye(4)
-        frame[:3, :3], frame[:3, 3] = axes, body.mass.com
+        frame = rigid_transform(axes, body.mass.com)
         pose = matrix_to_pose(T_world_object @ frame)
         with tempfile.TemporaryDirectory() as folder:
             number = self.bullet.createMultiBody(

@@ -1,8 +1,5 @@
 """A simulated RGB-D camera above the table, about as good as a Kinect's."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 import ctypes
 import os
 import sys
@@ -16,7 +13,7 @@ from mujoco.rendering.classic import gl_context
 
 from foretrace.actions import Action, Screwdriver
 from foretrace.errors import SimulationError
-from foretrace.geometry import matrix_to_pose, planar_transform
+from foretrace.geometry import matrix_to_pose, planar_transform, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Physics
 from foretrace.interactions.topdown import TopDownView
@@ -87,11 +84,9 @@ def take_rgbd(
         depth = render(renderer, data, "above", depth=True).astype(float)
     sigma = config.noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     depth += np.random.default_rng(seed).normal(size=depth.shape) * sigma
-    T = np.eye(4)
     # The image's rows run along -x and its columns along -y of the action frame, as in the top-down view.
-    T[:3, :3] = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
-    T[:3, 3] = config.position
-    return RgbdFrame(rgb, depth, camera, T)
+    axes = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return RgbdFrame(rgb, depth, camera, rigid_transform(axes, config.position))
 
 
 def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:

@@ -1,8 +1,5 @@
 """A simulated camera with its faults: distortion, defocus, noise, changing light, depth that errs."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Any

@@ -1,8 +1,5 @@
 """Free motion in MuJoCo, on the table of the lever-ups."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 import mujoco
 import numpy as np
 from jaxtyping import Float

@@ -1,8 +1,5 @@
 """Recordings of simulated lever-ups, with markers on object and table, as a camera above a table takes them."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +19,7 @@ from foretrace.geometry import (
     matrix_to_pose,
     planar_transform,
     pose_to_matrix,
+    rigid_transform,
     transform_points,
 )
 from foretrace.interactions import recording_folder
@@ -34,6 +32,7 @@ from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_imag
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.stage import ObjectColour, TableTop, cast_shadows, set_stage
+from foretrace.trajectories import interpolate
 
 DICTIONARY = "apriltag_36h11"
 MODULES = 8
@@ -187,7 +186,7 @@ def record_lever_up(
     lamp = cast_shadows(spec, np.random.default_rng([seed, 2])) if config.shadows else None
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
     times = _frame_times(action, action_start, config)
-    poses = _interpolate(motion, times - action_start)[0]
+    poses = _poses_at(motion, motion.object_pose, times - action_start)
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
         recording_folder.write_image(
@@ -259,10 +258,8 @@ def _held(camera: PinholeCamera, size: float, rng: np.random.Generator) -> Float
     pixel = rng.uniform([0.3, 0.3], [0.7, 0.7]) * [camera.width, camera.height]
     distance = rng.uniform(1.1, 1.9) * size * camera.fx / camera.width * 1.6
     turn, _ = cv2.Rodrigues(rng.uniform([-0.6, -0.6, -0.4], [0.6, 0.6, 0.4]))
-    pose = np.eye(4)
-    pose[:3, :3] = turn @ np.diag([1.0, -1.0, -1.0])  # the board faces the camera
-    pose[:3, 3] = distance * camera.rays(pixel[None])[0]
-    return pose
+    facing = turn @ np.diag([1.0, -1.0, -1.0])  # the board faces the camera
+    return rigid_transform(facing, distance * camera.rays(pixel[None])[0])
 
 
 def camera_pose(config: RecordingConfig) -> Float[np.ndarray, "4 4"]:
@@ -270,11 +267,9 @@ def camera_pose(config: RecordingConfig) -> Float[np.ndarray, "4 4"]:
     aim = np.array([0.08, 0.0, 0.0])
     horizontal = np.array([np.cos(config.azimuth), np.sin(config.azimuth), 0.0])
     away = np.sin(config.slant) * horizontal + np.array([0.0, 0.0, np.cos(config.slant)])
-    pose = np.eye(4)
     right = np.cross([0.0, 0.0, 1.0], horizontal)
-    pose[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
-    pose[:3, 3] = aim + config.distance * away
-    return pose
+    axes = np.column_stack([right, np.cross(-away, right), -away])
+    return rigid_transform(axes, aim + config.distance * away)
 
 
 def marker_spot(
@@ -336,14 +331,13 @@ def _layout(T_table_action: Float[np.ndarray, "4 4"], side: float, config: Recor
     return layout | {"table": table, "object": [{"id": OBJECT_ID, "side": side}]}
 
 
-def _interpolate(motion: Motion, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Object and tool poses between the engine's samples, at rest before the first and after the last."""
-    poses = []
-    for values in (motion.object_pose, motion.tool_pose):
-        mixed = np.column_stack([np.interp(times, motion.times, column) for column in values.T])
-        mixed[:, 3:] /= np.linalg.norm(mixed[:, 3:], axis=1, keepdims=True)
-        poses.append(mixed)
-    return poses[0], poses[1]
+def _poses_at(
+    motion: Motion, poses: Float[np.ndarray, "time 7"], times: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 7"]:
+    """Poses between the engine's samples, at rest before the first and after the last."""
+    mixed = interpolate(motion.times, poses, times)
+    mixed[:, 3:] /= np.linalg.norm(mixed[:, 3:], axis=1, keepdims=True)
+    return mixed
 
 
 def _frames(
@@ -384,10 +378,11 @@ def _background(
 
 def _place(lens: LensCamera, obj: ObjectModel, motion: Motion, time: float) -> None:
     """Puts object and tool where they are at a time since the path's start."""
-    pose, tool = (poses[0] for poses in _interpolate(motion, np.array([time])))
+    now = np.array([time])
+    pose, tool = (_poses_at(motion, poses, now)[0] for poses in (motion.object_pose, motion.tool_pose))
     lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(obj), 0.0))
     if motion.joints.shape[1]:
-        joints = [np.interp(time, motion.times, joint) for joint in motion.joints.T]
+        joints = interpolate(motion.times, motion.joints, now)[0]
     else:
         joints = [tool[0], tool[2], 2 * np.arctan2(tool[5], tool[3])]
     lens.data.qpos[7:] = joints

@@ -4,9 +4,6 @@ The scene lies in the action frame, so the tool's path is the same for every obj
 contact point at the origin, the action's direction along x (paper, section 3.1).
 """
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from collections.abc import Sequence
 
 import mujoco
