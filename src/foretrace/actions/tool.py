@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal
 
-from foretrace.errors import ActionError
+from foretrace.errors import ActionError, check_ranges
 from foretrace.registry import Registry
 
 Point = tuple[float, float, float]
@@ -106,7 +106,9 @@ class Screwdriver(Tool):
     """Distance from the tip to the handle's end in the holder [m]."""
 
     def __post_init__(self) -> None:
-        check_ranges("tool", self, dict.fromkeys((field.name for field in fields(self)), (1e-4, 0.5)))
+        check_ranges(
+            ActionError, "tool", self, dict.fromkeys((field.name for field in fields(self)), (1e-4, 0.5))
+        )
         if self.blade_length >= self.length:
             raise ActionError(
                 f"tool: blade_length = {self.blade_length} m does not fit in length = {self.length} m"
@@ -141,7 +143,7 @@ class Rod(Tool):
     """Distance from the tip to the end in the holder [m]."""
 
     def __post_init__(self) -> None:
-        check_ranges("tool", self, {"radius": (1e-3, 0.05), "length": (0.02, 0.5)})
+        check_ranges(ActionError, "tool", self, {"radius": (1e-3, 0.05), "length": (0.02, 0.5)})
         if 2 * self.radius >= self.length:
             raise ActionError(f"tool: radius = {self.radius} m is too large for length = {self.length} m")
 
@@ -149,21 +151,3 @@ class Rod(Tool):
         """The rod alone."""
         tip, end = (-self.radius, 0.0, 0.0), (-self.length, 0.0, 0.0)
         return (ToolPart("rod", "capsule", tip, end, self.radius, 0.1, STEEL),)
-
-
-def check_ranges(what: str, thing: Any, limits: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse a thing with an attribute out of its range.
-
-    Args:
-        what: Name of the thing, for the message.
-        thing: Has the attributes.
-        limits: Least and greatest value of each attribute.
-
-    Raises:
-        ActionError: An attribute is no number or outside its range.
-    """
-    for name, (low, high) in limits.items():
-        value = getattr(thing, name)
-        number = isinstance(value, int | float) or getattr(value, "ndim", None) == 0
-        if not (number and low <= value <= high):
-            raise ActionError(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: give SI units")

@@ -168,26 +168,19 @@ class World:
         Returns:
             Its number.
         """
-        b, parts = self.bullet, tool.parts()
-        boxes = [part.shape == "box" for part in parts]
-        ends = [np.array([part.start, part.end]) for part in parts]
-        shape = b.createCollisionShapeArray(
-            shapeTypes=[b.GEOM_BOX if box else b.GEOM_CAPSULE for box in boxes],
-            halfExtents=[part.end if box else [0, 0, 0] for part, box in zip(parts, boxes, strict=True)],
-            radii=[part.radius for part in parts],
-            lengths=[
-                0 if box else float(np.linalg.norm(end[0] - end[1]))
-                for end, box in zip(ends, boxes, strict=True)
-            ],
-            collisionFramePositions=[
-                part.start if box else (end.sum(axis=0) / 2).tolist()
-                for part, end, box in zip(parts, ends, boxes, strict=True)
-            ],
-            collisionFrameOrientations=[
-                [0, 0, 0, 1] if box else _turn_from_z(end[0] - end[1])
-                for end, box in zip(ends, boxes, strict=True)
-            ],
-        )
+        b, columns = self.bullet, ("shapeTypes", "halfExtents", "radii", "lengths")
+        columns += ("collisionFramePositions", "collisionFrameOrientations")
+        rows = []
+        for part in tool.parts():
+            if part.shape == "box":
+                rows.append((b.GEOM_BOX, part.end, part.radius, 0, part.start, [0, 0, 0, 1]))
+            else:
+                ends = np.array([part.start, part.end])
+                middle, along = (ends.sum(axis=0) / 2).tolist(), ends[0] - ends[1]
+                length = float(np.linalg.norm(along))
+                rows.append((b.GEOM_CAPSULE, [0, 0, 0], part.radius, length, middle, _turn_from_z(along)))
+        parts = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
+        shape = b.createCollisionShapeArray(**parts)
         number = b.createMultiBody(TOOL_MASS, shape)
         self._surface(number, friction)
         b.changeDynamics(number, -1, localInertiaDiagonal=[TOOL_MASS] * 3)

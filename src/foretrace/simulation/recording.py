@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float, UInt8
 
 from foretrace.actions import LeverUp, Motion
-from foretrace.errors import SimulationError
+from foretrace.errors import SimulationError, check_ranges
 from foretrace.files import write_json
 from foretrace.geometry import (
     invert_transform,
@@ -49,8 +49,8 @@ X_Z_PITCH = (0, 2, 4)
 OUT_OF_SIGHT = (0.0, 0.0, -5.0)
 FAULTS = Faults()
 """The nominal ones."""
+WIDTH_RANGE = {"width": (64, 7680)}
 RANGES = {
-    "width": (64, 7680),
     "distance": (0.1, 10.0),
     "slant": (0.0, 1.5),
     "azimuth": (-10.0, 10.0),
@@ -60,7 +60,8 @@ RANGES = {
     "exposures": (1, 100),
     "depth_every": (0, 1_000_000),
 }
-"""What can be recorded. Beyond, images do not fit into memory, or the camera is below the table or in the object."""
+"""What can be recorded."""
+WITHIN = "beyond, images do not fit into memory, or the camera is below the table or in the object"
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,8 @@ class RecordingConfig:
     def __post_init__(self) -> None:
         if self.simulation.engine != "mujoco":
             raise SimulationError(f"engine {self.simulation.engine!r} cannot record: take mujoco")
-        given = {"width": self.camera.width}
-        given |= {name: getattr(self, name) for name in RANGES if name != "width"}
-        for name, value in given.items():
-            low, high = RANGES[name]
-            if not low <= value <= high:
-                raise SimulationError(f"film: {name} = {value}, give a number from {low:g} to {high:g}")
+        check_ranges(SimulationError, "film", self.camera, WIDTH_RANGE, WITHIN)
+        check_ranges(SimulationError, "film", self, RANGES, WITHIN)
 
 
 @dataclass(frozen=True)
