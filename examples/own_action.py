@@ -48,13 +48,13 @@ class Pushes(Families):  # of the paper's objects, where it levers them
         return obj, [Push(each.contact, each.direction) for each in lever_ups]
 
 
-RECIPES.add("pushes", Pushes(("prism",)))  # in a package: an entry point of the group foretrace.recipes
-
 if __name__ == "__main__":
+    RECIPES.add("pushes", Pushes(("prism",)))  # in a package: an entry point of the group foretrace.recipes
     config = ft.CollectConfig(1, 1, 0, ft.SimulationConfig(embodiment="tool"), "pushes")
     ft.collect(config, sys.argv[1], workers=1)
     for stored in ft.Dataset.open(sys.argv[1]):
         same = np.array_equal(ft.replay(stored).effect.com_trajectory, stored.effect.com_trajectory)
-        bullet = ft.simulate(stored.object, stored.action, engine="bullet", embodiment="tool")
-        first, second = (100 * np.linalg.norm(np.ptp(each.effect.com_trajectory[[0, -1]], axis=0)) for each in (stored, bullet))
-        print(f"{stored.effect.outcome}, {first} cm in MuJoCo, {second} in Bullet; same again: {same}")
+        again = ft.simulate(stored.object, stored.action, engine="bullet", embodiment="tool")
+        ways = (each.effect.com_trajectory for each in (stored, again))
+        mujoco, bullet = (f"{100 * np.linalg.norm(way[-1] - way[0]):.2f}" for way in ways)
+        print(f"{stored.effect.outcome}, {mujoco} cm in MuJoCo, {bullet} in Bullet; same again: {same}")

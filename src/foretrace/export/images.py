@@ -11,7 +11,7 @@ from foretrace.errors import ExportError, SimulationError
 from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
-from foretrace.simulation.camera import make_renderer, render
+from foretrace.simulation.camera import compile_with_camera, make_renderer, render
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.tool import add_tool
 
@@ -66,12 +66,7 @@ def render_images(
     body = spec.worldbody.add_body(name="tool")
     body.add_freejoint()
     add_tool(body, Screwdriver(), 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
-    # MuJoCo's camera has y up and looks along -z.
-    T_action_lens = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-    lens = matrix_to_pose(T_action_lens)
-    spec.worldbody.add_camera(name="beside", pos=lens[:3], quat=lens[3:])
-    model = spec.compile()
-    model.cam_fovy[0] = np.rad2deg(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
+    model = compile_with_camera(spec, pose, CAMERA.height, CAMERA.width, CAMERA.fy)
     data = mujoco.MjData(model)
     bodies = matrix_to_pose(pose_to_matrix(object_poses) @ planar_transform(body_origin(obj), 0.0))
     shape = (len(bodies), CAMERA.height, CAMERA.width)
@@ -84,8 +79,8 @@ def render_images(
         for k in range(len(bodies)):
             data.qpos[:] = np.concatenate([bodies[k], tool_poses[k]])
             mujoco.mj_forward(model, data)
-            rgb[k] = render(renderer, data, "beside")
-            depth[k] = render(renderer, data, "beside", depth=True)
+            rgb[k] = render(renderer, data)
+            depth[k] = render(renderer, data, depth=True)
     return RenderedImages(rgb, depth, CAMERA, pose)
 
 
