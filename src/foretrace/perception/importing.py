@@ -371,18 +371,7 @@ def _record(
     com = transform_points(poses, obj.mass_properties(1.0).com[None])[:, 0]
     action = replace(observation.action, path=config.path)
     tool = tool_poses(action.tool_motion(grid))
-    judgement = action.judge(Motion(grid, trajectory, tool, np.empty((len(grid), 0))), obj, com)
-    effect = Effect(
-        times=grid,
-        pose_trajectory=trajectory,
-        com_trajectory=com,
-        tool_trajectory=tool,
-        joint_trajectory=np.empty((len(grid), 0)),
-        support_points=np.full((2, 2), np.nan),
-        support_corners=(),
-        outcome=judgement.outcome,
-        slip_index=judgement.slip_index,
-    )
+    effect = Effect.judged(Motion(grid, trajectory, tool, np.empty((len(grid), 0))), obj, action, com)
     provenance = Provenance(
         source="recorded",
         engine="",

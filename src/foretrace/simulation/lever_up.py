@@ -196,33 +196,14 @@ def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics
         action: The executed action.
         physics: Friction and density.
     """
-    unknown = np.full((2, 2), np.nan)
     if motion.diverged:
-        empty = np.empty((0, 7))
+        empty, unknown = np.empty((0, 7)), np.full((2, 2), np.nan)
         joints = np.empty((0, motion.joints.shape[1]))
         return Effect(np.empty(0), empty, np.empty((0, 3)), empty, joints, unknown, (), FAILED)
     motion, fall = _until_the_floor(motion, obj, physics)
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
     com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
-    judgement = action.judge(motion, obj, com)
-    if judgement.outcome not in action.outcomes:
-        raise SimulationError(
-            f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
-            f"{', '.join(action.outcomes)}"
-        )
-    return Effect(
-        times=motion.times,
-        pose_trajectory=motion.object_pose,
-        com_trajectory=com,
-        tool_trajectory=motion.tool_pose,
-        joint_trajectory=motion.joints,
-        support_points=unknown if judgement.support_points is None else judgement.support_points,
-        support_corners=judgement.support_corners,
-        outcome=judgement.outcome,
-        slip_index=judgement.slip_index,
-        fall_index=fall,
-        path_error=motion.path_error,
-    )
+    return Effect.judged(motion, obj, action, com, fall)
 
 
 def _transformed(effect: Effect, T_commanded_executed: Float[np.ndarray, "4 4"]) -> Effect:

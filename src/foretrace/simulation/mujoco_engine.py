@@ -24,6 +24,7 @@ from foretrace.simulation.engine import (
     STANDING_DEPTH,
     Engine,
     ToolMotion,
+    check_divides,
     sample_tool,
     used_coordinates,
 )
@@ -68,11 +69,7 @@ class MujocoEngine(Engine):
             raise SimulationError(
                 f"embodiment {embodiment!r} is unknown: choose one of {', '.join(EMBODIMENTS)}"
             )
-        for period in (sample_period, arm.CONTROL_PERIOD):
-            if not 0 < timestep <= period or abs(period / timestep - round(period / timestep)) > 1e-9:
-                raise SimulationError(
-                    f"timestep = {timestep} s does not divide {period} s: take 0.002 s or a half of it"
-                )
+        check_divides(timestep, sample_period, arm.CONTROL_PERIOD)
         self.embodiment, self.timestep, self.sample_period = embodiment, timestep, sample_period
         self._kept: tuple[Any, ObjectModel, mujoco.MjModel, mujoco.MjData] | None = None
 

@@ -186,11 +186,9 @@ def record_lever_up(
     poses = _poses_at(motion, motion.object_pose, times - action_start)
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
-        recording_folder.write_image(
-            folder / recording_folder.BACKGROUND, _background(lens, obj, motion, config, rng)
-        )
-        frames = _frames(lens, obj, motion, times, action_start, config, rng)
-        write_recording(folder, frames, RecordingNotes(action_start=None))
+        take = _Take(lens, obj, motion, config, rng)
+        recording_folder.write_image(folder / recording_folder.BACKGROUND, take.background())
+        write_recording(folder, take.frames(times, action_start), RecordingNotes())
     truth = RecordingTruth(
         interaction,
         times,
@@ -337,49 +335,48 @@ def _poses_at(
     return mixed
 
 
-def _frames(
-    lens: LensCamera,
-    obj: ObjectModel,
-    motion: Motion,
-    times: Float[np.ndarray, " frame"],
-    action_start: float,
-    config: RecordingConfig,
-    rng: np.random.Generator,
-) -> Iterator[Frame]:
-    phase = rng.uniform(0, 2 * np.pi)
-    offsets = 0.01 * (np.arange(config.exposures) - (config.exposures - 1) / 2) / config.exposures
-    for number, time in enumerate(times):
-        blended = np.zeros((lens.camera.height, lens.camera.width, 3), dtype=np.float32)
-        for offset in offsets:
-            _place(lens, obj, motion, time - action_start + offset)
-            blended += lens.colours() / config.exposures
-        light = np.sin(phase + 2 * np.pi * 0.3 * (time - times[0]))
-        image = spoil(blended, config.faults, float(light), rng)
-        depth = None
-        if config.depth_every and number % config.depth_every == 0:
-            _place(lens, obj, motion, time - action_start)
-            depth = spoil_depth(lens.depths(), config.faults, rng)
-        yield Frame(round(float(time), 6), image, depth)
+@dataclass(frozen=True)
+class _Take:
+    """A motion in front of a camera."""
 
+    lens: LensCamera
+    obj: ObjectModel
+    motion: Motion
+    config: RecordingConfig
+    rng: np.random.Generator
 
-def _background(
-    lens: LensCamera, obj: ObjectModel, motion: Motion, config: RecordingConfig, rng: np.random.Generator
-) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The table before the object was put there, in the mean of some images."""
-    _place(lens, obj, motion, 0.0)
-    lens.data.qpos[:3] = OUT_OF_SIGHT
-    perfect = lens.colours()
-    images = [spoil(perfect, config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
-    return np.rint(np.mean(images, axis=0)).astype(np.uint8)
+    def frames(self, times: Float[np.ndarray, " frame"], action_start: float) -> Iterator[Frame]:
+        """The motion, frame by frame."""
+        config, rng = self.config, self.rng
+        phase = rng.uniform(0, 2 * np.pi)
+        offsets = 0.01 * (np.arange(config.exposures) - (config.exposures - 1) / 2) / config.exposures
+        for number, time in enumerate(times):
+            blended = np.zeros((config.camera.height, config.camera.width, 3), dtype=np.float32)
+            for offset in offsets:
+                self.place(time - action_start + offset)
+                blended += self.lens.colours() / config.exposures
+            light = np.sin(phase + 2 * np.pi * 0.3 * (time - times[0]))
+            image = spoil(blended, config.faults, float(light), rng)
+            depth = None
+            if config.depth_every and number % config.depth_every == 0:
+                self.place(time - action_start)
+                depth = spoil_depth(self.lens.depths(), config.faults, rng)
+            yield Frame(round(float(time), 6), image, depth)
 
+    def background(self) -> UInt8[np.ndarray, "rows columns 3"]:
+        """The table before the object was put there, in the mean of some images."""
+        self.place(0.0)
+        self.lens.data.qpos[:3] = OUT_OF_SIGHT
+        perfect, rng = self.lens.colours(), self.rng
+        images = [spoil(perfect, self.config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
+        return np.rint(np.mean(images, axis=0)).astype(np.uint8)
 
-def _place(lens: LensCamera, obj: ObjectModel, motion: Motion, time: float) -> None:
-    """Puts object and tool where they are at a time since the path's start."""
-    now = np.array([time])
-    pose, tool = (_poses_at(motion, poses, now)[0] for poses in (motion.object_pose, motion.tool_pose))
-    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(obj), 0.0))
-    if motion.joints.shape[1]:
-        joints = interpolate(motion.times, motion.joints, now)[0]
-    else:
-        joints = [tool[0], tool[2], 2 * np.arctan2(tool[5], tool[3])]
-    lens.data.qpos[7:] = joints
+    def place(self, time: float) -> None:
+        """Puts object and tool where they are at a time since the path's start."""
+        motion, now, qpos = self.motion, np.array([time]), self.lens.data.qpos
+        pose, tool = (_poses_at(motion, poses, now)[0] for poses in (motion.object_pose, motion.tool_pose))
+        qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(self.obj), 0.0))
+        if motion.joints.shape[1]:
+            qpos[7:] = interpolate(motion.times, motion.joints, now)[0]
+        else:
+            qpos[7:] = [tool[0], tool[2], 2 * np.arctan2(tool[5], tool[3])]
