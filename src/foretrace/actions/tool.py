@@ -5,6 +5,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from foretrace.errors import ActionError, check_ranges
 from foretrace.registry import Registry
 
@@ -37,6 +40,23 @@ class ToolPart:
     """Mass [kg]."""
     colour: Colour
     """Colour in pictures."""
+
+    @property
+    def length(self) -> float:
+        """Length of a capsule's axis [m]; 0 for a box."""
+        return 0.0 if self.shape == "box" else float(np.linalg.norm(np.subtract(self.start, self.end)))
+
+    @property
+    def pose(self) -> Float[np.ndarray, "7"]:
+        """Middle in the tool's frame [m], and quaternion (w, x, y, z) that turns the z axis along a capsule."""
+        if self.shape == "box":
+            return np.array([*self.start, 1.0, 0.0, 0.0, 0.0])
+        start, end = np.array(self.start), np.array(self.end)
+        x, y, z = (start - end) / np.linalg.norm(start - end)
+        across = float(np.hypot(x, y))
+        axis = np.array([-y / across, x / across] if across else [1.0, 0.0])
+        turn = [np.sqrt((1 + z) / 2), *(np.sqrt((1 - z) / 2) * axis), 0.0]
+        return np.array([*(start + end) / 2, *turn])
 
 
 TOOLS: Registry[type["Tool"]] = Registry("tool", "foretrace.tools", ActionError)

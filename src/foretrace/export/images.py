@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foretrace.actions import Screwdriver
 from foretrace.errors import ExportError, SimulationError
 from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
@@ -51,7 +50,7 @@ def render_images(
     object_poses: Float[np.ndarray, "time 7"],
     tool_poses: Float[np.ndarray, "time 7"],
 ) -> RenderedImages:
-    """Renders a simulated interaction: object, screwdriver and table, without the arm.
+    """Renders a simulated interaction: object, tool and table, without the arm.
 
     Args:
         interaction: Whose object, on whose table.
@@ -62,10 +61,10 @@ def render_images(
         ExportError: The machine cannot render.
     """
     obj, pose = interaction.object, camera_pose()
-    spec = build_scene(obj, interaction.physics, Screwdriver(), None, timestep=0.002)
+    spec = build_scene(obj, interaction.physics, interaction.action.tool, None, timestep=0.002)
     body = spec.worldbody.add_body(name="tool")
     body.add_freejoint()
-    add_tool(body, Screwdriver(), 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
+    add_tool(body, interaction.action.tool, 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
     model = compile_with_camera(spec, pose, CAMERA.height, CAMERA.width, CAMERA.fy)
     data = mujoco.MjData(model)
     bodies = matrix_to_pose(pose_to_matrix(object_poses) @ planar_transform(body_origin(obj), 0.0))

@@ -168,19 +168,15 @@ class World:
         Returns:
             Its number.
         """
-        b, columns = self.bullet, ("shapeTypes", "halfExtents", "radii", "lengths")
-        columns += ("collisionFramePositions", "collisionFrameOrientations")
-        rows = []
-        for part in tool.parts():
-            if part.shape == "box":
-                rows.append((b.GEOM_BOX, part.end, part.radius, 0, part.start, [0, 0, 0, 1]))
-            else:
-                ends = np.array([part.start, part.end])
-                middle, along = (ends.sum(axis=0) / 2).tolist(), ends[0] - ends[1]
-                length = float(np.linalg.norm(along))
-                rows.append((b.GEOM_CAPSULE, [0, 0, 0], part.radius, length, middle, _turn_from_z(along)))
-        parts = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
-        shape = b.createCollisionShapeArray(**parts)
+        b, parts = self.bullet, tool.parts()
+        shape = b.createCollisionShapeArray(
+            shapeTypes=[b.GEOM_BOX if part.shape == "box" else b.GEOM_CAPSULE for part in parts],
+            halfExtents=[part.end if part.shape == "box" else [0, 0, 0] for part in parts],
+            radii=[part.radius for part in parts],
+            lengths=[part.length for part in parts],
+            collisionFramePositions=[part.pose[:3].tolist() for part in parts],
+            collisionFrameOrientations=[part.pose[[4, 5, 6, 3]].tolist() for part in parts],
+        )
         number = b.createMultiBody(TOOL_MASS, shape)
         self._surface(number, friction)
         b.changeDynamics(number, -1, localInertiaDiagonal=[TOOL_MASS] * 3)
@@ -250,15 +246,6 @@ class World:
         file = folder / "pieces.obj"
         file.write_text(_wavefront(hulls), encoding="ascii")
         return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
-
-
-def _turn_from_z(direction: Float[np.ndarray, " 3"]) -> list[float]:
-    """Quaternion (x, y, z, w) that turns the z axis into a direction."""
-    x, y, z = direction / np.linalg.norm(direction)
-    across = float(np.hypot(x, y))
-    axis = [-y / across, x / across] if across else [1.0, 0.0]
-    half_sine = float(np.sqrt((1 - z) / 2))
-    return [half_sine * axis[0], half_sine * axis[1], 0.0, float(np.sqrt((1 + z) / 2))]
 
 
 def _convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:
