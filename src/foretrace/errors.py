@@ -67,7 +67,7 @@ def check_ranges(
     error: type[ForetraceError],
     what: str,
     thing: Any,
-    limits: Mapping[str, tuple[float, float]],
+    limits: Mapping[str, tuple[int | float, int | float]],
     remedy: str = "give SI units",
 ) -> None:
     """Refuse a thing with an attribute out of its range.
