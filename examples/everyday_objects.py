@@ -13,7 +13,7 @@ COLUMNS = 9
 
 
 def main(out: Path) -> None:
-    turn = len(RECIPES["everyday"])
+    turn = len(RECIPES["everyday"].families)
     figure, axes = plt.subplots(len(NAMES), COLUMNS, figsize=(COLUMNS, len(NAMES)), layout="constrained")
     for row, (place, name) in zip(axes, NAMES.items(), strict=True):
         for k, ax in enumerate(row):

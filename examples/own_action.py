@@ -1,13 +1,13 @@
 """Add an action of your own, a push with a rod, and record it: python examples/own_action.py FOLDER."""
 
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 import foretrace as ft
 from foretrace.actions import Judgement, Motion, Rod, minimum_jerk
-from foretrace.simulation.collect import trial
+from foretrace.simulation.recipes import RECIPES, Families
 
 
 @dataclass(frozen=True)
@@ -42,19 +42,19 @@ class Push(ft.Action):
         return {"distance": self.path.distance, "speed": self.path.speed}
 
 
-def push_trial(config: ft.CollectConfig, id: int, engine: str = "mujoco") -> ft.Interaction:
-    obj, lever_up, _ = trial(config, id)
-    push = Push(lever_up.contact, lever_up.direction)
-    return replace(ft.simulate(obj, push, engine=engine, embodiment="tool"), id=id)
+class Pushes(Families):  # of the paper's objects, where it levers them
+    def make(self, seed: int, object_index: int, per_edge: int) -> tuple[ft.Prism, list[Push]]:
+        obj, lever_ups = super().make(seed, object_index, per_edge)
+        return obj, [Push(each.contact, each.direction) for each in lever_ups]
 
 
 if __name__ == "__main__":
-    config, folder = ft.CollectConfig(objects=1, contacts_per_edge=1), sys.argv[1]
-    ft.collect(config, folder, workers=1, simulate=push_trial)
-    for stored in ft.Dataset.open(folder):
+    RECIPES.add("pushes", Pushes(("prism",)))  # in a package: an entry point of the group foretrace.recipes
+    config = ft.CollectConfig(1, 1, 0, ft.SimulationConfig(embodiment="tool"), "pushes")
+    ft.collect(config, sys.argv[1], workers=1)
+    for stored in ft.Dataset.open(sys.argv[1]):
         same = np.array_equal(ft.replay(stored).effect.com_trajectory, stored.effect.com_trajectory)
-        ways = [push_trial(config, stored.id, name).effect.com_trajectory for name in ("mujoco", "bullet")]
-        mujoco, bullet = (100 * np.linalg.norm(way[-1] - way[0]) for way in ways)
-        print(
-            f"{stored.effect.outcome}, {mujoco:.2f} cm in MuJoCo, {bullet:.2f} in Bullet; same again: {same}"
-        )
+        again = ft.simulate(stored.object, stored.action, engine="bullet", embodiment="tool")
+        ways = (each.effect.com_trajectory for each in (stored, again))
+        mujoco, bullet = (f"{100 * np.linalg.norm(way[-1] - way[0]):.2f}" for way in ways)
+        print(f"{stored.effect.outcome}, {mujoco} cm in MuJoCo, {bullet} in Bullet; same again: {same}")

@@ -171,9 +171,7 @@ def test_actions_of_ones_own_must_name_their_outcomes():
 
 def test_an_outcome_that_was_not_declared_is_an_error(monkeypatch):
     monkeypatch.setattr(EXAMPLE_MODULE.Push, "outcomes", ("flown",))
-    with pytest.raises(
-        SimulationError, match="'push' was judged 'pushed', which is none of its outcomes: flown"
-    ):
+    with pytest.raises(ActionError, match="'push' was judged 'pushed', which is none of its outcomes: flown"):
         simulate(SQUARE, placed("push"), embodiment="tool")
 
 

@@ -28,7 +28,7 @@ from foretrace.objects import Box, Cylinder, Prism
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig
-from foretrace.simulation.recipes import num_edges
+from foretrace.simulation.recipes import RECIPES
 
 SMALL = CollectConfig(objects=16)
 """208 trials: three shards."""
@@ -92,7 +92,7 @@ def reference(tmp_path_factory) -> Path:
 def test_the_papers_trials_are_2080():
     config = CollectConfig()
     assert num_trials(config) == 2080
-    counts = [num_edges("paper", k) for k in range(config.objects)]
+    counts = [RECIPES["paper"].num_edges(k) for k in range(config.objects)]
     assert [counts.count(n) for n in range(3, 11)] == [20] * 8
     located = [collecting._locate(config, id) for id in range(2080)]
     assert located == [(k, contact) for k in range(160) for contact in range(2 * counts[k])]
@@ -101,7 +101,7 @@ def test_the_papers_trials_are_2080():
 @pytest.mark.parametrize("objects", [1, 3, 8, 13])
 def test_any_number_of_objects_is_spread_over_the_corner_counts(objects):
     config = CollectConfig(objects=objects)
-    counts = [num_edges("paper", k) for k in range(objects)]
+    counts = [RECIPES["paper"].num_edges(k) for k in range(objects)]
     assert num_trials(config) == 2 * sum(counts)
     assert max(map(counts.count, counts)) - min(map(counts.count, counts)) <= 1
     obj, _, _ = trial(config, num_trials(config) - 1)
@@ -171,9 +171,13 @@ def test_the_mixed_recipe_takes_turns():
         obj, _, _ = trial(config, located.index((k, 0)))
         kinds.append(type(obj))
         assert located.count((k, 0)) == 1
-        assert sum(index == k for index, _ in located) == 2 * len(obj.corners) == 2 * num_edges("mixed", k)
+        assert (
+            sum(index == k for index, _ in located)
+            == 2 * len(obj.corners)
+            == 2 * RECIPES["mixed"].num_edges(k)
+        )
     assert kinds == [Prism, Prism, Cylinder, Box, Prism] * 8
-    prisms = [num_edges("mixed", k) for k in range(40) if k % 5 < 2]
+    prisms = [RECIPES["mixed"].num_edges(k) for k in range(40) if k % 5 < 2]
     assert sorted(prisms) == sorted([*range(3, 11)] * 2)
     fewer = replace(config, objects=11)
     for id in (0, 13, 50, num_trials(fewer) - 1):
@@ -186,7 +190,10 @@ def test_the_everyday_recipe_has_every_family():
     located = [collecting._locate(config, id) for id in range(num_trials(config))]
     objects = [trial(config, located.index((k, 0)))[0] for k in range(40)]
     for k, obj in enumerate(objects):
-        kind, edges = (Cylinder if k % 10 == 3 else Box if k % 10 == 4 else Prism), num_edges("everyday", k)
+        kind, edges = (
+            (Cylinder if k % 10 == 3 else Box if k % 10 == 4 else Prism),
+            RECIPES["everyday"].num_edges(k),
+        )
         assert type(obj) is kind
         assert (edges == len(obj.corners)) == (k % 10 < 6)
         assert sum(index == k for index, _ in located) == 2 * edges

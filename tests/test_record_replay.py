@@ -52,7 +52,7 @@ def replay_all(config: CollectConfig, folder: Path, every: int = 1) -> None:
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_rows_of_every_recipe_with_everything_drawn(tmp_path, recipe):
-    objects = len(RECIPES[recipe])
+    objects = len(RECIPES[recipe].families)
     simulation = replace(TOOL, watch_time=0.4)
     config = CollectConfig(objects, 1, 3, simulation, recipe, EVERYTHING, PATH, SLIM)
     replay_all(config, tmp_path, every=3)

@@ -90,7 +90,7 @@ def test_recordings_are_learned_from_and_judged_like_simulations(
 
 def test_a_film_of_nothing(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["film", str(simulated), "99999", "--out", str(tmp_path / "film")]) == 2
-    assert "has no interaction 99999 with a motion" in capsys.readouterr().err
+    assert "has no interaction 99999 among" in capsys.readouterr().err
     assert main(["film", str(simulated), "0", "--out", str(simulated)]) == 2
     assert "is in use: choose another folder" in capsys.readouterr().err
 

@@ -332,13 +332,13 @@ def test_a_fall_is_noticed_and_the_record_cut(depths, kept):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"watch_time": -1.0}, "watch_time = -1.0 s is outside 0 to 60 s"),
+        ({"watch_time": -1.0}, "watch_time = -1.0 is outside 0 to 60"),
         ({"physics": Physics(table_edge=0.0)}, "table_edge = 0.0 m: give a distance"),
         ({"physics": Physics(density=1e30)}, "density = 1e\\+30 is outside 1 to 100000"),
         ({"physics": Physics(density=float("nan"))}, "density = nan is outside"),
         ({"physics": Physics(friction=-0.1)}, "friction = -0.1 is outside 0 to 10"),
         ({"physics": Physics(tool_friction=1e9)}, "tool_friction = 1000000000.0 is outside 0 to 10"),
-        ({"physics": Physics(rolling_friction=1.0)}, "rolling_friction = 1.0 m is outside .* lever arm"),
+        ({"physics": Physics(rolling_friction=1.0)}, "rolling_friction = 1.0 is outside .* lever arm"),
     ],
 )
 def test_impossible_settings_are_refused(wrong, message):

@@ -3,6 +3,9 @@
 Every message names the offending value and says what to do; the command line prints it as one line.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class ForetraceError(Exception):
     """Base of every error that foretrace raises on purpose."""
@@ -58,3 +61,29 @@ class RobotError(ForetraceError):
 
 class ExportError(ForetraceError):
     """An export that cannot be written: nothing chosen, the target exists, a library is missing, uneven sampling."""
+
+
+def check_ranges(
+    error: type[ForetraceError],
+    what: str,
+    thing: Any,
+    limits: Mapping[str, tuple[int | float, int | float]],
+    remedy: str = "give SI units",
+) -> None:
+    """Refuse a thing with an attribute out of its range.
+
+    Args:
+        error: The class to raise.
+        what: Name of the thing, for the message.
+        thing: Has the attributes.
+        limits: Least and greatest value of each attribute.
+        remedy: What to do about it; ends the message.
+
+    Raises:
+        ForetraceError: Of the given class: an attribute is no number or outside its range.
+    """
+    for name, (low, high) in limits.items():
+        value = getattr(thing, name)
+        number = isinstance(value, int | float) or getattr(value, "ndim", None) == 0
+        if not (number and low <= value <= high):
+            raise error(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: {remedy}")

@@ -202,6 +202,15 @@ def matrix_to_pose(transform: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarr
     return np.concatenate([transform[..., :3, 3], matrix_to_quaternion(transform[..., :3, :3])], axis=-1)
 
 
+def rigid_transform(
+    rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"] | Sequence[float]
+) -> Float[np.ndarray, "4 4"]:
+    """Transform that turns, then shifts [m]."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, position
+    return transform
+
+
 def planar_transform(
     position: Float[np.ndarray, "2"] | Float[np.ndarray, "3"] | Sequence[float], angle: float
 ) -> Float[np.ndarray, "4 4"]:

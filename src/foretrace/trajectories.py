@@ -126,6 +126,13 @@ def check_poses(
         )
 
 
+def interpolate(
+    times: Float[np.ndarray, " known"], values: Float[np.ndarray, "known k"], at: Float[np.ndarray, " time"]
+) -> Float[np.ndarray, "time k"]:
+    """Values between known ones, linearly; constant beyond the first and the last. Times in seconds."""
+    return np.column_stack([np.interp(at, times, column) for column in values.T])
+
+
 def interpolate_poses(
     times: Float[np.ndarray, " known"],
     transforms: Float[np.ndarray, "known 4 4"],
@@ -141,7 +148,7 @@ def interpolate_poses(
     if len(times) == 1:
         return np.repeat(transforms, len(at), axis=0)
     poses = np.tile(np.eye(4), (len(at), 1, 1))
-    poses[:, :3, 3] = np.column_stack([np.interp(at, times, column) for column in transforms[:, :3, 3].T])
+    poses[:, :3, 3] = interpolate(times, transforms[:, :3, 3], at)
     between = Slerp(times, Rotation.from_matrix(transforms[:, :3, :3]))
     poses[:, :3, :3] = between(np.clip(at, times[0], times[-1])).as_matrix()
     return poses

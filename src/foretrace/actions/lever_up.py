@@ -10,8 +10,8 @@ from jaxtyping import Float
 from foretrace.actions.base import Action, minimum_jerk
 from foretrace.actions.lever_up_judge import Outcome, judge_lever_up
 from foretrace.actions.motion import FAILED, Judgement, Motion
-from foretrace.actions.tool import Screwdriver, check_ranges
-from foretrace.errors import ActionError
+from foretrace.actions.tool import Screwdriver
+from foretrace.errors import ActionError, check_ranges
 from foretrace.objects import ObjectModel
 
 APPROACH = (0.0035, 0.002, 0.3)
@@ -70,7 +70,7 @@ class ToolPath:
             "lift_time": (0.05, 60.0),
             "hold_time": (0.0, 60.0),
         }
-        check_ranges("tool path", self, limits)
+        check_ranges(ActionError, "tool path", self, limits)
 
     @property
     def duration(self) -> float:

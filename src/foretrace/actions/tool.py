@@ -5,7 +5,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal
 
-from foretrace.errors import ActionError
+import numpy as np
+from jaxtyping import Float
+
+from foretrace.errors import ActionError, check_ranges
 from foretrace.registry import Registry
 
 Point = tuple[float, float, float]
@@ -37,6 +40,23 @@ class ToolPart:
     """Mass [kg]."""
     colour: Colour
     """Colour in pictures."""
+
+    @property
+    def length(self) -> float:
+        """Length of a capsule's axis [m]; 0 for a box."""
+        return 0.0 if self.shape == "box" else float(np.linalg.norm(np.subtract(self.start, self.end)))
+
+    @property
+    def pose(self) -> Float[np.ndarray, "7"]:
+        """Middle in the tool's frame [m], and quaternion (w, x, y, z) that turns the z axis along a capsule."""
+        if self.shape == "box":
+            return np.array([*self.start, 1.0, 0.0, 0.0, 0.0])
+        start, end = np.array(self.start), np.array(self.end)
+        x, y, z = (start - end) / np.linalg.norm(start - end)
+        across = float(np.hypot(x, y))
+        axis = np.array([-y / across, x / across] if across else [1.0, 0.0])
+        turn = [np.sqrt((1 + z) / 2), *(np.sqrt((1 - z) / 2) * axis), 0.0]
+        return np.array([*(start + end) / 2, *turn])
 
 
 TOOLS: Registry[type["Tool"]] = Registry("tool", "foretrace.tools", ActionError)
@@ -106,7 +126,9 @@ class Screwdriver(Tool):
     """Distance from the tip to the handle's end in the holder [m]."""
 
     def __post_init__(self) -> None:
-        check_ranges("tool", self, dict.fromkeys((field.name for field in fields(self)), (1e-4, 0.5)))
+        check_ranges(
+            ActionError, "tool", self, dict.fromkeys((field.name for field in fields(self)), (1e-4, 0.5))
+        )
         if self.blade_length >= self.length:
             raise ActionError(
                 f"tool: blade_length = {self.blade_length} m does not fit in length = {self.length} m"
@@ -141,7 +163,7 @@ class Rod(Tool):
     """Distance from the tip to the end in the holder [m]."""
 
     def __post_init__(self) -> None:
-        check_ranges("tool", self, {"radius": (1e-3, 0.05), "length": (0.02, 0.5)})
+        check_ranges(ActionError, "tool", self, {"radius": (1e-3, 0.05), "length": (0.02, 0.5)})
         if 2 * self.radius >= self.length:
             raise ActionError(f"tool: radius = {self.radius} m is too large for length = {self.length} m")
 
@@ -149,21 +171,3 @@ class Rod(Tool):
         """The rod alone."""
         tip, end = (-self.radius, 0.0, 0.0), (-self.length, 0.0, 0.0)
         return (ToolPart("rod", "capsule", tip, end, self.radius, 0.1, STEEL),)
-
-
-def check_ranges(what: str, thing: Any, limits: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse a thing with an attribute out of its range.
-
-    Args:
-        what: Name of the thing, for the message.
-        thing: Has the attributes.
-        limits: Least and greatest value of each attribute.
-
-    Raises:
-        ActionError: An attribute is no number or outside its range.
-    """
-    for name, (low, high) in limits.items():
-        value = getattr(thing, name)
-        number = isinstance(value, int | float) or getattr(value, "ndim", None) == 0
-        if not (number and low <= value <= high):
-            raise ActionError(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: give SI units")

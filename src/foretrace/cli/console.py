@@ -1,13 +1,24 @@
 """Lines that several commands print."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 
 def say(line: Any) -> None:
     """One line to the person at the terminal, beside the command's own output."""
     print(f"foretrace: {line}", file=sys.stderr)
+
+
+@contextmanager
+def when_interrupted(line: str) -> Iterator[None]:
+    """Tell what is left after Ctrl-C in a block."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"interrupted; {line}")
+        raise
 
 
 def print_outcomes(counts: Mapping[str, int]) -> None:

@@ -1,15 +1,12 @@
 """Options that say where an object is levered."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from foretrace.actions import LeverUp
 from foretrace.errors import ActionError, PredictionError
-
-if TYPE_CHECKING:
-    from foretrace.actions import LeverUp
-    from foretrace.objects import ObjectModel
+from foretrace.objects import ObjectModel
 
 LARGEST_SNAP = 0.02
 """A contact point farther from the outline is a mistake and is not moved there [m]."""
@@ -38,15 +35,13 @@ class ContactOptions:
             raise PredictionError("--fraction goes with --edge: give one, or leave it out")
         return None if self.edge is None else (self.edge, 0.5 if self.fraction is None else self.fraction)
 
-    def place(self, obj: "ObjectModel") -> "LeverUp":
+    def place(self, obj: ObjectModel) -> LeverUp:
         """The lever-up of an object.
 
         Raises:
             PredictionError: Options do not go together.
             ActionError: There is no such edge, or the point is too far from the outline.
         """
-        from foretrace.actions import LeverUp
-
         if (self.edge is None) == (self.contact is None):
             raise PredictionError("give either --edge (with --fraction) or --contact X Y")
         if self.share is not None:

@@ -6,6 +6,11 @@ from tyro.conf import Positional
 
 from foretrace.cli.console import print_outcomes
 from foretrace.errors import DatasetError
+from foretrace.files import write_json
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.description import describe_dataset
+from foretrace.interactions.doctor import examine
+from foretrace.interactions.upgrade import upgrade as upgrade_in_place
 
 
 def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, out: Path | None = None) -> int:
@@ -21,12 +26,6 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
         upgrade: Bring a data set of format version 1 to today's format first, in place.
         out: JSON file for the description.
     """
-    from foretrace.files import write_json
-    from foretrace.interactions.dataset import Dataset
-    from foretrace.interactions.description import describe_dataset
-    from foretrace.interactions.doctor import examine
-    from foretrace.interactions.upgrade import upgrade as upgrade_in_place
-
     if upgrade:
         print(f"{path}: {upgrade_in_place(path) or 'no'} interactions upgraded")
     diagnosis = examine(path, repair)
@@ -69,7 +68,6 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
         out: File to write: .png, .svg or .pdf; with an id also .gif or .mp4. By default pictures go to the
             data set's folder figures.
     """
-    from foretrace.interactions.dataset import Dataset
     from foretrace.pictures.animation import interaction_animation
     from foretrace.pictures.contact_sheet import contact_sheet
     from foretrace.pictures.scene import interaction_figure

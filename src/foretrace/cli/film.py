@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
 from foretrace.cli.parsing import adapt
-from foretrace.errors import DatasetError, PerceptionError, SimulationError
+from foretrace.errors import PerceptionError, SimulationError
 from foretrace.files import write_json
 from foretrace.geometry import invert_transform
 from foretrace.interactions import recording_folder
@@ -56,12 +56,7 @@ def film(
         if not 0 <= value <= most:
             raise SimulationError(f"--{option} is {value}: give a number from 0 to {most}")
     dataset = Dataset.open(data)
-    rows = np.flatnonzero(dataset.index["id"].to_numpy() == id)
-    if len(rows) == 0:
-        raise DatasetError(
-            f"{data} has no interaction {id} with a motion: `foretrace data` counts what it has"
-        )
-    shown = dataset[int(rows[0])]
+    shown = dataset.with_id(id)
     camera = WEBCAM.scaled(width / WEBCAM.width)
     recorded = dataset.manifest["configuration"].get("simulation", {})
     simulation = SimulationConfig(

@@ -2,15 +2,25 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 from tyro.conf import Positional
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from foretrace.imagined import ImaginedEffect
-    from foretrace.interactions.record import Interaction
+from foretrace.cli.futures import radius_of
+from foretrace.errors import DatasetError, PerceptionError
+from foretrace.experiments.transfer_figures import side_figure
+from foretrace.geometry import pose_to_matrix, transform_points
+from foretrace.imagined import ImaginedEffect
+from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.interactions.record import Interaction
+from foretrace.interactions.recorded import read_notes
+from foretrace.interactions.recording_folder import Frame
+from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay, write_video
+from foretrace.perception.recordings import open_recording
+from foretrace.predictor import load_predictor
+from foretrace.trajectories import interpolate_poses
 
 
 def overlay(
@@ -31,16 +41,6 @@ def overlay(
         run: Folder of the training; by default the predictor that comes with foretrace.
         topic: Image topic of a bag, if it has several.
     """
-    import numpy as np
-
-    from foretrace.errors import DatasetError, PerceptionError
-    from foretrace.experiments.transfer_figures import side_figure
-    from foretrace.interactions.dataset import Dataset
-    from foretrace.interactions.recorded import read_notes
-    from foretrace.perception.overlay import write_video
-    from foretrace.perception.recordings import open_recording
-    from foretrace.predictor import load_predictor
-
     if out.suffix.lower() != ".mp4":
         raise PerceptionError(f"cannot write a video to {out}: choose a name that ends in .mp4")
     dataset = Dataset.open(data)
@@ -65,17 +65,9 @@ def overlay(
 
 
 def _drawn(
-    frames: "Iterator[Any]", notes: dict[str, Any], interaction: "Interaction", imagined: "ImaginedEffect"
-) -> "Iterator[np.ndarray]":
+    frames: Iterator[Frame], notes: dict[str, Any], interaction: Interaction, imagined: ImaginedEffect
+) -> Iterator[np.ndarray]:
     """The recording's images with outline and paths in them."""
-    import numpy as np
-
-    from foretrace.cli.futures import radius_of
-    from foretrace.geometry import pose_to_matrix, transform_points
-    from foretrace.interactions.pinhole import PinholeCamera
-    from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay
-    from foretrace.trajectories import interpolate_poses
-
     camera = PinholeCamera.from_dict(notes["camera"], "the recording's camera")
     T_action_camera = np.array(notes["T_action_camera"])
     obj, effect = interaction.object, interaction.effect

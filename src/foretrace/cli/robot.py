@@ -1,20 +1,28 @@
 """The command that has a real arm execute a lever-up."""
 
+from dataclasses import asdict
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
 from tyro.conf import OmitArgPrefixes, arg
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli.console import say
 from foretrace.errors import RobotError
+from foretrace.files import write_json
+from foretrace.geometry import matrix_to_pose
+from foretrace.robot.checks import ArmLimits, Check, check_path, refuse_unsafe
 from foretrace.robot.execution import WatchConfig
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from foretrace.robot.checks import Check
-    from foretrace.robot.path import ArmPath
+from foretrace.robot.execution import execute as move
+from foretrace.robot.kinematics import ArmKinematics
+from foretrace.robot.path import ArmPath, plan_lever_up, plan_retreat, read_base_pose
+from foretrace.robot.video import VideoRecorder
+from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
 
 
 def robot(
@@ -53,12 +61,6 @@ def robot(
         yes: Do not ask before the arm moves.
         camera: Film the motion into the folder's film: number of a camera, or what else OpenCV opens.
     """
-    from foretrace.robot.checks import ArmLimits, check_path, refuse_unsafe
-    from foretrace.robot.execution import execute as move
-    from foretrace.robot.kinematics import ArmKinematics
-    from foretrace.robot.path import plan_lever_up, plan_retreat, read_base_pose
-    from foretrace.robot.video import VideoRecorder
-
     if execute and host is None:
         raise RobotError("--execute needs --host, the controller's address")
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
@@ -80,7 +82,7 @@ def robot(
         print("dry run: nothing was moved and no connection opened; --execute moves the arm")
         return
 
-    def confirm(approach: "list[Check]") -> bool:
+    def confirm(approach: list[Check]) -> bool:
         _print_checks(approach)
         return yes or _agreed(host, sum(len(leg.joints) for leg in legs))
 
@@ -102,8 +104,6 @@ def robot(
 
 def _agreed(host: str, num_set_points: int) -> bool:
     """Whether the user agrees at the terminal."""
-    from foretrace.simulation.arm import CONTROL_PERIOD
-
     seconds = num_set_points * CONTROL_PERIOD
     try:
         answer = input(f"Move the arm at {host} for {seconds:.0f} s and its way to the start? Type yes: ")
@@ -112,13 +112,8 @@ def _agreed(host: str, num_set_points: int) -> bool:
     return answer.strip() == "yes"
 
 
-def _print_checks(checks: "list[Check]") -> None:
+def _print_checks(checks: list[Check]) -> None:
     """A table for each leg."""
-    from itertools import groupby
-
-    from rich.console import Console
-    from rich.table import Table
-
     for leg, members in groupby(checks, key=lambda check: check.leg):
         table = Table(title=leg.capitalize(), title_justify="left", box=None, padding=(0, 1))
         for heading in ("check", "joint", "at [s]", "worst", "limit", ""):
@@ -135,16 +130,8 @@ def _print_checks(checks: "list[Check]") -> None:
         Console().print(table)
 
 
-def _write(out: Path, legs: "list[ArmPath]", tips: "list[list[np.ndarray]]", checks: "list[Check]") -> None:
+def _write(out: Path, legs: list[ArmPath], tips: list[list[np.ndarray]], checks: list[Check]) -> None:
     """The planned path, with the blade tip in the table frame, and its checks."""
-    from dataclasses import asdict
-
-    import pandas as pd
-
-    from foretrace.files import write_json
-    from foretrace.geometry import matrix_to_pose
-    from foretrace.simulation.arm import JOINT_NAMES
-
     rows, start = [], 0.0
     for leg, along in zip(legs, tips, strict=True):
         for time, joints, tip in zip(leg.times, leg.joints, along, strict=True):

@@ -1,14 +1,16 @@
 """The command that simulates data sets."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from foretrace.cli.console import print_outcomes, say
+from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.cli.parsing import adapt
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION
 
 ROLLING_TIME = 1.5
 """Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
@@ -38,10 +40,6 @@ def simulate(
         vary_action: Draw insertion, arc and speed of the blade anew for every lever-up.
         workers: Number of processes; by default one for each core.
     """
-    from dataclasses import replace
-
-    from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION
-
     if watch_time is None:
         watch_time = 0.0 if config.recipe == "paper" else ROLLING_TIME
     randomisation = RANDOMISED if randomise else NOTHING
@@ -49,10 +47,7 @@ def simulate(
         randomisation = replace(randomisation, **VARIED_ACTION)
     simulation = replace(config.simulation, watch_time=watch_time)
     config = replace(config, simulation=simulation, randomisation=randomisation)
-    try:
+    with when_interrupted(f"what is done stays in {out}, the same command goes on from there"):
         counts = collect(config, out, workers)
-    except KeyboardInterrupt:
-        say(f"interrupted; what is done stays in {out}, the same command goes on from there")
-        raise
     print_outcomes(counts)
     print(f"data set: {out}")

@@ -10,7 +10,7 @@ import docstring_parser
 from tyro.conf import OmitArgPrefixes, arg
 
 from foretrace import predictor as learned
-from foretrace.cli.console import say
+from foretrace.cli.console import when_interrupted
 from foretrace.cli.parsing import adapt
 from foretrace.features import FEATURES, FeatureExtractor
 from foretrace.files import write_text
@@ -132,9 +132,6 @@ def _train(
     dataset = Dataset.open(data).where(outcome=outcomes)
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
-    try:
+    with when_interrupted(f"the best model so far is in {out}, the same command goes on from there"):
         learned.train_predictor(dataset, config, out, replace(training, split=split), resume=not fresh)
-    except KeyboardInterrupt:
-        say(f"interrupted; the best model so far is in {out}, the same command goes on from there")
-        raise
     print(f"predictor: {out}")

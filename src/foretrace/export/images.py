@@ -1,20 +1,16 @@
 """Images of an interaction over time, rendered again from its recorded poses by a camera beside the table."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foretrace.actions import Screwdriver
 from foretrace.errors import ExportError, SimulationError
-from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
+from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
-from foretrace.simulation.camera import make_renderer, render
+from foretrace.simulation.camera import compile_with_camera, make_renderer, render
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.tool import add_tool
 
@@ -46,10 +42,7 @@ def camera_pose() -> Float[np.ndarray, "4 4"]:
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = CAMERA_POSITION
-    return pose
+    return rigid_transform(np.column_stack([right, np.cross(forward, right), forward]), CAMERA_POSITION)
 
 
 def render_images(
@@ -57,7 +50,7 @@ def render_images(
     object_poses: Float[np.ndarray, "time 7"],
     tool_poses: Float[np.ndarray, "time 7"],
 ) -> RenderedImages:
-    """Renders a simulated interaction: object, screwdriver and table, without the arm.
+    """Renders a simulated interaction: object, tool and table, without the arm.
 
     Args:
         interaction: Whose object, on whose table.
@@ -68,16 +61,11 @@ def render_images(
         ExportError: The machine cannot render.
     """
     obj, pose = interaction.object, camera_pose()
-    spec = build_scene(obj, interaction.physics, Screwdriver(), None, timestep=0.002)
+    spec = build_scene(obj, interaction.physics, interaction.action.tool, None, timestep=0.002)
     body = spec.worldbody.add_body(name="tool")
     body.add_freejoint()
-    add_tool(body, Screwdriver(), 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
-    # MuJoCo's camera has y up and looks along -z.
-    T_action_lens = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-    lens = matrix_to_pose(T_action_lens)
-    spec.worldbody.add_camera(name="beside", pos=lens[:3], quat=lens[3:])
-    model = spec.compile()
-    model.cam_fovy[0] = np.rad2deg(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
+    add_tool(body, interaction.action.tool, 0.0, pos=np.zeros(3), quat=np.array([1.0, 0.0, 0.0, 0.0]))
+    model = compile_with_camera(spec, pose, CAMERA.height, CAMERA.width, CAMERA.fy)
     data = mujoco.MjData(model)
     bodies = matrix_to_pose(pose_to_matrix(object_poses) @ planar_transform(body_origin(obj), 0.0))
     shape = (len(bodies), CAMERA.height, CAMERA.width)
@@ -90,8 +78,8 @@ def render_images(
         for k in range(len(bodies)):
             data.qpos[:] = np.concatenate([bodies[k], tool_poses[k]])
             mujoco.mj_forward(model, data)
-            rgb[k] = render(renderer, data, "beside")
-            depth[k] = render(renderer, data, "beside", depth=True)
+            rgb[k] = render(renderer, data)
+            depth[k] = render(renderer, data, depth=True)
     return RenderedImages(rgb, depth, CAMERA, pose)
 
 

@@ -23,9 +23,10 @@ from foretrace.export.episode_statistics import (
 )
 from foretrace.export.episodes import Episode
 from foretrace.export.images import CAMERA, render_images
-from foretrace.export.resampling import frame_times, frames_per_second, resample, resample_poses
+from foretrace.export.resampling import frame_times, frames_per_second, resample_poses
 from foretrace.files import write_json
 from foretrace.interactions.topdown import VIEW_SIZE
+from foretrace.trajectories import interpolate
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
@@ -214,7 +215,7 @@ def _columns(episode: Episode, layout: Layout, number: int, start: int) -> dict[
     columns = {
         "observation.state": tool,
         "observation.environment_state": np.column_stack(
-            [thing, resample(here, effect.com_trajectory, times)]
+            [thing, interpolate(here, effect.com_trajectory, times)]
         ),
         "action": np.concatenate([tool[1:], tool[-1:]]),  # where the blade goes next
         VIEW: np.broadcast_to(interaction.view.height[None, :, :, None], (n, VIEW_SIZE, VIEW_SIZE, 1)),
@@ -225,10 +226,10 @@ def _columns(episode: Episode, layout: Layout, number: int, start: int) -> dict[
         "task_index": np.zeros(n, dtype=np.int64),
     }
     if "observation.joints" in layout.features:
-        columns["observation.joints"] = resample(here, effect.joint_trajectory, times)
+        columns["observation.joints"] = interpolate(here, effect.joint_trajectory, times)
     if episode.imagined is not None:
         there = episode.imagined.times - effect.times[0]
-        columns["imagined.com"] = resample(there, episode.imagined.com_trajectory, times)
+        columns["imagined.com"] = interpolate(there, episode.imagined.com_trajectory, times)
     if COLOUR in layout.features:
         seen = render_images(interaction, thing, tool)
         columns |= {COLOUR: seen.rgb, DEPTH: seen.depth[..., None]}

@@ -8,14 +8,12 @@ from jaxtyping import Float, Int, Shaped, UInt8
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from foretrace.export.scenery import Colour
+from foretrace.actions.tool import Colour, ToolPart
 from foretrace.interactions.pinhole import PinholeCamera
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 SHAPES = {"box": 1, "sphere": 2, "cylinder": 3, "triangles": 11}
 """Numbers of `visualization_msgs/Marker`."""
-ALONG_X = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
-"""Quaternion (w, x, y, z) that lays a cylinder, which stands along z, along x."""
 
 
 class Messages:
@@ -123,23 +121,29 @@ class Messages:
         name: str,
         id: int,
         shape: str,
-        centre: Float[np.ndarray, "3"],
+        pose: Float[np.ndarray, "7"],
         size: Float[np.ndarray, "3"],
         colour: Colour,
     ) -> Any:
-        """A marker in the shape of a box, a sphere, or a cylinder along x; sizes are whole lengths [m]."""
-        lying = shape == "cylinder"
-        turned = ALONG_X if lying else (1.0, 0.0, 0.0, 0.0)
+        """A marker in the shape of a box, a sphere, or a cylinder along z; sizes are whole lengths [m]."""
         return self.marker(
             stamp,
             frame,
             name,
             id,
             type=SHAPES[shape],
-            pose=self.pose(np.array([*centre, *turned])),
-            scale=self.vector(size[::-1] if lying else size),
+            pose=self.pose(pose),
+            scale=self.vector(size),
             color=self.colour(colour),
         )
+
+    def part(self, stamp: int, frame: str, name: str, id: int, part: ToolPart) -> Any:
+        """A part of a tool; a cylinder stands for a capsule, which RViz does not have."""
+        if part.shape == "box":
+            shape, size = "box", 2 * np.array(part.end)
+        else:
+            shape, size = "cylinder", 2 * part.radius + np.array([0.0, 0.0, part.length])
+        return self.solid(stamp, frame, name, id, shape, part.pose, size, part.colour)
 
     def mesh(
         self,

@@ -11,17 +11,16 @@ from jaxtyping import Float
 from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
 from foretrace.export.images import RenderedImages, images_of_samples
-from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, Colour, tool_parts
+from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, Colour
 from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Effect
 from foretrace.objects.surface import triangles_of
+from foretrace.trajectories import interpolate
 
 TIMELINE = "time"
 APPLICATION = "foretrace"
 PATH_RADIUS = 0.0015
 """Radius of drawn paths [m]."""
-ALONG_X = (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))
-"""Quaternion (x, y, z, w) that lays a cylinder, which stands along z, along x."""
 TABLE = np.array([0.5, 0.4, 0.002])
 """Size of the drawn part of the table [m]."""
 
@@ -116,21 +115,21 @@ def _log_scene(recording: rr.RecordingStream, episode: Episode) -> None:
             "action/imagined/object/shape",
             rr.Mesh3D(vertex_positions=flat, vertex_normals=facing, albedo_factor=[*_bytes(IMAGINED), 90]),
         )
-    for name, part in zip(("blade", "shaft", "handle"), tool_parts(), strict=True):
+    for part in interaction.action.tool.parts():
         colour = [_bytes(part.colour)]
         solid: rr.AsComponents = rr.Boxes3D(
-            centers=[part.centre], sizes=[part.size], colors=colour, fill_mode="solid"
+            centers=[part.start], half_sizes=[part.end], colors=colour, fill_mode="solid"
         )
-        if part.shape == "cylinder":
+        if part.shape == "capsule":
             solid = rr.Cylinders3D(
-                lengths=[part.size[0]],
-                radii=[part.size[1] / 2],
-                centers=[part.centre],
-                quaternions=[rr.Quaternion(xyzw=ALONG_X)],
+                lengths=[part.length + 2 * part.radius],
+                radii=[part.radius],
+                centers=[part.pose[:3]],
+                quaternions=[rr.Quaternion(xyzw=part.pose[[4, 5, 6, 3]])],
                 colors=colour,
                 fill_mode="solid",
             )
-        log(f"action/tool/{name}", solid)
+        log(f"action/tool/{part.name}", solid)
     log("view/height", rr.DepthImage(interaction.view.height, meter=1.0))
     if episode.imagined is not None:
         log("action/imagined/path", _strip(episode.imagined.com_trajectory, IMAGINED))
@@ -170,7 +169,7 @@ def distances(
 ) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]:
     """How far the imagined centre of mass is from the observed one [m], at the observed times [s] that both have."""
     common = effect.times[(effect.times >= times[0]) & (effect.times <= times[-1])]
-    there = np.column_stack([np.interp(common, times, axis) for axis in com.T])
+    there = interpolate(times, com, common)
     here = effect.com_trajectory[np.isin(effect.times, common)]
     return common, np.linalg.norm(here - there, axis=1)
 

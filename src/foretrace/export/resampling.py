@@ -49,16 +49,6 @@ def frame_times(times: Float[np.ndarray, " time"], fps: int) -> Float[np.ndarray
     return np.arange(int(np.floor((times[-1] - times[0]) * fps + EVEN * fps)) + 1) / fps
 
 
-def resample(
-    times: Float[np.ndarray, " time"], values: Float[np.ndarray, "time k"], at: Float[np.ndarray, " frame"]
-) -> Float[np.ndarray, "frame k"]:
-    """Values between samples, linearly; before the first and after the last they stay.
-
-    Times in seconds.
-    """
-    return np.column_stack([np.interp(at, times, column) for column in values.T])
-
-
 def resample_poses(
     times: Float[np.ndarray, " time"], poses: Float[np.ndarray, "time 7"], at: Float[np.ndarray, " frame"]
 ) -> Float[np.ndarray, "frame 7"]:

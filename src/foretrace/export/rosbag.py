@@ -19,7 +19,7 @@ from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
 from foretrace.export.images import RenderedImages, images_of_samples
 from foretrace.export.messages import TRANSFORMS, Messages
-from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, tool_parts
+from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED
 from foretrace.geometry import matrix_to_pose
 from foretrace.objects.surface import triangles_of
 
@@ -147,12 +147,15 @@ def _observed_paths(episode: Episode, make: Messages) -> Iterator[Stamped]:
 def _markers(episode: Episode, make: Messages) -> Iterator[Stamped]:
     effect, last = episode.interaction.effect, -np.inf
     for k, stamp in enumerate(stamps_of(effect.times)):
-        dots = [
-            make.solid(stamp, ACTION, "centre of mass", 0, "sphere", effect.com_trajectory[k], DOT, OBSERVED)
-        ]
+        centres = [(effect.com_trajectory[k], OBSERVED)]
         if episode.imagined is not None:
-            there = episode.imagined.com_trajectory[_nearest(episode, k)]
-            dots.append(make.solid(stamp, ACTION, "centre of mass", 1, "sphere", there, DOT, IMAGINED))
+            centres.append((episode.imagined.com_trajectory[_nearest(episode, k)], IMAGINED))
+        dots = [
+            make.solid(
+                stamp, ACTION, "centre of mass", id, "sphere", np.array([*com, 1, 0, 0, 0]), DOT, colour
+            )
+            for id, (com, colour) in enumerate(centres)
+        ]
         if effect.times[k] - last >= MARKER_PERIOD:
             last = effect.times[k]
             dots += _bodies(episode, make, stamp)
@@ -165,8 +168,8 @@ def _bodies(episode: Episode, make: Messages, stamp: int) -> Iterator[Any]:
     yield make.mesh(stamp, THING, "object", 0, surface, OBJECT, 0.35)
     if episode.imagined_pose is not None:
         yield make.mesh(stamp, GHOST, "imagined object", 0, surface, IMAGINED, 0.3)
-    for id, part in enumerate(tool_parts()):
-        yield make.solid(stamp, TOOL, "tool", id, part.shape, part.centre, part.size, part.colour)
+    for id, part in enumerate(episode.interaction.action.tool.parts()):
+        yield make.part(stamp, TOOL, "tool", id, part)
 
 
 def _images(

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import Action
+from foretrace.actions import Action, Motion
 from foretrace.actions import Outcome as Outcome
+from foretrace.errors import ActionError
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 
@@ -42,6 +43,48 @@ class Effect:
     """First sample at which the object was falling off the table, or None; the record ends above the floor."""
     path_error: float = 0.0
     """Largest distance of the tool's tip from its planned path [m]."""
+
+    @classmethod
+    def judged(
+        cls,
+        motion: Motion,
+        obj: ObjectModel,
+        action: Action,
+        com: Float[np.ndarray, "time 3"],
+        fall_index: int | None = None,
+    ) -> "Effect":
+        """What was seen, and what the action's judge concludes.
+
+        Args:
+            motion: The motion in the frame of the executed action.
+            obj: The object.
+            action: The executed action.
+            com: Centre of mass over time [m].
+            fall_index: First sample at which the object falls off the table.
+
+        Raises:
+            ActionError: The judge names an outcome that the action does not have.
+        """
+        judgement = action.judge(motion, obj, com)
+        if judgement.outcome not in action.outcomes:
+            raise ActionError(
+                f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
+                f"{', '.join(action.outcomes)}"
+            )
+        support = judgement.support_points
+        return cls(
+            times=motion.times,
+            pose_trajectory=motion.object_pose,
+            com_trajectory=com,
+            tool_trajectory=motion.tool_pose,
+            joint_trajectory=motion.joints,
+            support_points=np.full((2, 2), np.nan) if support is None else support,
+            support_corners=judgement.support_corners,
+            outcome=judgement.outcome,
+            slip_index=judgement.slip_index,
+            fall_index=fall_index,
+            path_error=motion.path_error,
+        )
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from foretrace.geometry import (
     invert_transform,
     matrix_to_pose,
     planar_transform,
+    rigid_transform,
     transform_points,
 )
 from foretrace.interactions.pinhole import PinholeCamera
@@ -231,10 +232,8 @@ def _rest(
 
 def _mean_transform(transforms: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
     """Mean of poses that are nearly alike."""
-    mean = np.eye(4)
-    mean[:3, :3] = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
-    mean[:3, 3] = transforms[:, :3, 3].mean(axis=0)
-    return mean
+    rotation = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
+    return rigid_transform(rotation, transforms[:, :3, 3].mean(axis=0))
 
 
 def _place(
@@ -372,18 +371,7 @@ def _record(
     com = transform_points(poses, obj.mass_properties(1.0).com[None])[:, 0]
     action = replace(observation.action, path=config.path)
     tool = tool_poses(action.tool_motion(grid))
-    judgement = action.judge(Motion(grid, trajectory, tool, np.empty((len(grid), 0))), obj, com)
-    effect = Effect(
-        times=grid,
-        pose_trajectory=trajectory,
-        com_trajectory=com,
-        tool_trajectory=tool,
-        joint_trajectory=np.empty((len(grid), 0)),
-        support_points=np.full((2, 2), np.nan),
-        support_corners=(),
-        outcome=judgement.outcome,
-        slip_index=judgement.slip_index,
-    )
+    effect = Effect.judged(Motion(grid, trajectory, tool, np.empty((len(grid), 0))), obj, action, com)
     provenance = Provenance(
         source="recorded",
         engine="",

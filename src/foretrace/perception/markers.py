@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, Shaped, UInt8
 
 from foretrace.errors import PerceptionError
 from foretrace.files import read_versioned
-from foretrace.geometry import invert_transform, planar_transform, transform_points
+from foretrace.geometry import invert_transform, planar_transform, rigid_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
 
 FORMAT = "foretrace-markers"
@@ -299,10 +299,7 @@ def shortest_side(corners: Float[np.ndarray, "4 2"]) -> float:
 
 def to_transform(rvec: np.ndarray, tvec: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """OpenCV's rotation and translation vector as a transform."""
-    transform = np.eye(4)
-    transform[:3, :3], _ = cv2.Rodrigues(np.asarray(rvec, dtype=float))
-    transform[:3, 3] = np.ravel(tvec)
-    return transform
+    return rigid_transform(cv2.Rodrigues(np.asarray(rvec, dtype=float))[0], np.ravel(tvec))
 
 
 @dataclass(frozen=True)

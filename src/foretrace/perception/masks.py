@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from foretrace.errors import PerceptionError
-from foretrace.geometry import invert_transform
+from foretrace.geometry import invert_transform, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import MINIMAL_HEIGHT
-from foretrace.perception.shadows import Shadow, find_shadow
+from foretrace.perception.shadows import Shadow, filled, find_shadow, grown, opened, patches
 
 LEAST_CHANGE = 14.0
 """A pixel whose colour differs by more than this from the background's belongs to something new [of 255]."""
@@ -190,9 +190,10 @@ def find_by_background(
         PerceptionError: As `cover_by_background` and `pick_object`.
     """
     cover = cover_by_background(image, background, shadows=shadows)
-    whole, near = pick_object(cover > 0.5, point).astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8)
-    inside, beside = cv2.erode(whole, near[1:-1, 1:-1]) > 0, cv2.dilate(whole, near) > 0
-    return np.where(inside, 1.0, np.where(beside, cover, 0.0))
+    whole = pick_object(cover > 0.5, point)
+    near = np.ones((2 * BORDER - 1,) * 2, np.uint8)
+    inside = cv2.erode(whole.astype(np.uint8), near) > 0
+    return np.where(inside, 1.0, np.where(grown(whole, BORDER), cover, 0.0))
 
 
 def find_by_height(
@@ -224,12 +225,8 @@ def pick_object(
     Raises:
         PerceptionError: There is none, or none near the point, or the border cuts it off.
     """
-    cleaned = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     # Holes first: a marker on the object may look like the table, and have islands in it.
-    contours, _ = cv2.findContours(cleaned, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    filled = cv2.drawContours(np.zeros_like(cleaned), contours, -1, 1, cv2.FILLED)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(filled, connectivity=8)
-    areas = stats[1:, cv2.CC_STAT_AREA]
+    labels, areas = patches(filled(opened(mask, 3)))
     large = 1 + np.flatnonzero(areas >= SMALLEST_OBJECT)
     if len(large) == 0:
         raise PerceptionError(
@@ -250,12 +247,8 @@ def pick_object(
         nearest = int(distance.argmin())
         chosen = int(labels[rows[nearest], columns[nearest]])
     found = labels == chosen
-    for side, pixels in (
-        ("top", found[0]),
-        ("bottom", found[-1]),
-        ("left", found[:, 0]),
-        ("right", found[:, -1]),
-    ):
+    sides = {"top": found[0], "bottom": found[-1], "left": found[:, 0], "right": found[:, -1]}
+    for side, pixels in sides.items():
         if pixels.any():
             raise PerceptionError(f"the object is cut off by the {side} border of the image: show it whole")
     return found
@@ -300,11 +293,9 @@ def find_table(
         )
     normal = -normal if normal @ middle > 0 else normal  # towards the camera
     along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    T = np.eye(4)
-    T[:3, 0], T[:3, 2] = along / np.linalg.norm(along), normal
-    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
-    T[:3, 3] = normal * (middle @ normal)
-    return invert_transform(T)
+    along /= np.linalg.norm(along)
+    axes = np.column_stack([along, np.cross(normal, along), normal])
+    return invert_transform(rigid_transform(axes, normal * (middle @ normal)))
 
 
 def _fit_plane(points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

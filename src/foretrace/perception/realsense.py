@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, check_ranges
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import Frame
 from foretrace.perception.bags import TOGETHER
@@ -46,9 +46,10 @@ class CaptureConfig:
     """Serial number of the camera; None: the only one."""
 
     def __post_init__(self) -> None:
-        for name, least in (("width", 1), ("height", 1), ("frames_per_second", 1), ("depth_every", 0)):
-            if getattr(self, name) < least:
-                raise PerceptionError(f"capture: {name} = {getattr(self, name)}, it must be at least {least}")
+        limits = dict.fromkeys(("width", "height", "frames_per_second"), (1, np.inf)) | {
+            "depth_every": (0, np.inf)
+        }
+        check_ranges(PerceptionError, "capture", self, limits, "give a whole number")
 
 
 def is_recording(path: Path) -> bool:

@@ -76,16 +76,16 @@ def find_shadow(
     off = np.abs(now - part[..., None] * before).max(axis=2)
     alike = (off < NOISE + COLOUR_CHANGE * now.max(axis=2)) & (part > LEAST_LIGHT)
     darker = changed & alike & (part < 1.0)
-    if not _opened(darker, 3).any():
+    if not opened(darker, 3).any():
         return None
     darker &= ~_objects(now.mean(axis=2), before.mean(axis=2), darker)
-    shadow = _opened(darker, 3)
-    if _patches(shadow)[1].max(initial=0) < SMALLEST_SHADOW:
+    shadow = opened(darker, 3)
+    if patches(shadow)[1].max(initial=0) < SMALLEST_SHADOW:
         return None
-    things = _filled(_opened(changed & ~darker, 5))
+    things = filled(opened(changed & ~darker, 5))
     shadow &= ~things
     _check(things, alike, shadow)
-    hidden = _grown(things, BORDER) & ~(shadow & ~_grown(things, BORDER // 2))
+    hidden = grown(things, BORDER) & ~(shadow & ~grown(things, BORDER // 2))
     seen = (~hidden).astype(np.float32)
     weight = np.maximum(cv2.GaussianBlur(seen, (0, 0), 1.5), 1e-6)[..., None]
     light = cv2.GaussianBlur(seen[..., None] * (now + 1.0) / (before + 1.0), (0, 0), 1.5) / weight
@@ -127,7 +127,7 @@ def _objects(
         other |= clear & flat & ~keeps
         kept |= clear & keeps
         undecided &= ~clear
-    labels, areas = _patches(darker)
+    labels, areas = patches(darker)
     lacking, keeping = (np.bincount(labels[mask], minlength=len(areas) + 1)[1:] for mask in (other, kept))
     objects = (lacking > MOST_LACKING * (lacking + keeping)) & (lacking > 0.5 * areas)
     doubtful = ~objects & (lacking > LEAST_LACKING * areas) & (lacking > keeping)
@@ -146,37 +146,37 @@ def _check(
     Raises:
         PerceptionError: There is nothing else, or something within a shadow, or something of the background's colour.
     """
-    labels, areas = _patches(things)
+    labels, areas = patches(things)
     large = 1 + np.flatnonzero(areas >= SMALLEST_PATCH)
-    doubtful = len(large) == 0 and _patches(shadow)[1].max(initial=0) >= SMALLEST_PATCH
+    doubtful = len(large) == 0 and patches(shadow)[1].max(initial=0) >= SMALLEST_PATCH
     size = (ENCLOSING_GAP, ENCLOSING_GAP)
-    enclosed = _filled(
-        cv2.morphologyEx(shadow.astype(np.uint8), cv2.MORPH_CLOSE, np.ones(size, np.uint8)) > 0
-    )
+    enclosed = filled(cv2.morphologyEx(shadow.astype(np.uint8), cv2.MORPH_CLOSE, np.ones(size, np.uint8)) > 0)
     for k in large:
         thing = labels == k
-        ring = _grown(thing, 2 * BORDER) & ~thing
+        ring = grown(thing, 2 * BORDER) & ~thing
         doubtful |= enclosed[thing].mean() > 0.5
         doubtful |= shadow[ring].any() and alike[thing].mean() > MOST_ALIKE
     if doubtful:
         raise PerceptionError(DOUBTFUL)
 
 
-def _grown(mask: Bool[np.ndarray, "rows columns"], by: int) -> Bool[np.ndarray, "rows columns"]:
+def grown(mask: Bool[np.ndarray, "rows columns"], by: int) -> Bool[np.ndarray, "rows columns"]:
+    """A mask and what lies around it, that many pixels wide."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1,) * 2, np.uint8)) > 0
 
 
-def _opened(mask: Bool[np.ndarray, "rows columns"], size: int) -> Bool[np.ndarray, "rows columns"]:
+def opened(mask: Bool[np.ndarray, "rows columns"], size: int) -> Bool[np.ndarray, "rows columns"]:
+    """A mask without what is narrower than some pixels."""
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) > 0
 
 
-def _filled(mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+def filled(mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
     """A mask without holes."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(np.zeros(mask.shape, np.uint8), contours, -1, 1, cv2.FILLED) > 0
 
 
-def _patches(mask: Bool[np.ndarray, "rows columns"]) -> tuple[np.ndarray, np.ndarray]:
+def patches(mask: Bool[np.ndarray, "rows columns"]) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the patches of a mask, from 1, and their areas [pixel]."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     return labels, stats[1:, cv2.CC_STAT_AREA]

@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.errors import RobotError
+from foretrace.errors import RobotError, check_ranges
 from foretrace.robot.checks import ArmLimits, Check, check_path, check_start, refuse_unsafe
 from foretrace.robot.controller import ArmState, UrController
 from foretrace.robot.kinematics import ArmKinematics
@@ -44,9 +43,7 @@ class WatchConfig:
     """Largest angle between a joint and its set points of the last moments [rad]."""
 
     def __post_init__(self) -> None:
-        for name, low, high in (("timeout", 0.05, 2.0), ("deviation", 0.001, 0.5)):
-            if not low <= getattr(self, name) <= high:
-                raise RobotError(f"{name} = {getattr(self, name)} is outside {low:g} to {high:g}")
+        check_ranges(RobotError, "watch", self, {"timeout": (0.05, 2.0), "deviation": (0.001, 0.5)})
 
 
 class MotionLog:
@@ -80,9 +77,7 @@ class MotionLog:
     def __enter__(self) -> "MotionLog":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self._file.close()
 
     def add(self, leg: str, state: ArmState, commanded: Float[np.ndarray, "6"]) -> None:

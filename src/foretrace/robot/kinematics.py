@@ -1,8 +1,5 @@
 """Where every part of the arm and its screwdriver is at given joint angles, in the arm's base frame."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 
 import mujoco
@@ -10,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Screwdriver
-from foretrace.geometry import transform_points
+from foretrace.geometry import rigid_transform, transform_points
 from foretrace.interactions.record import Physics
 from foretrace.simulation import arm
 from foretrace.simulation.scene import build_scene
@@ -76,16 +73,14 @@ class ArmKinematics:
         mujoco.mj_comPos(model, data)
         jacobian, tip = np.zeros((6, model.nv)), data.site("tip")
         mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site("tip").id)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = tip.xmat.reshape(3, 3), tip.xpos - self._base
         axes = data.geom_xmat[self._capsules].reshape(-1, 3, 3)[:, :, 2]
         half = axes * model.geom_size[self._capsules, 1, None]
         middles = data.geom_xpos[self._capsules] - self._base
         signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]), axis=-1).reshape(8, 3)
-        T_base_blade, blade = np.eye(4), data.geom("blade")
-        T_base_blade[:3, :3], T_base_blade[:3, 3] = blade.xmat.reshape(3, 3), blade.xpos - self._base
+        blade = data.geom("blade")
+        T_base_blade = rigid_transform(blade.xmat.reshape(3, 3), blade.xpos - self._base)
         return Posture(
-            T_base_tip=T,
+            T_base_tip=rigid_transform(tip.xmat.reshape(3, 3), tip.xpos - self._base),
             flange=data.site("flange").xpos - self._base,
             wrist=data.body("link_wrist_3").xpos - self._base,
             jacobian=jacobian,

@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 
@@ -45,9 +44,7 @@ class VideoRecorder:
         self._first.wait(PATIENCE)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         if not self._thread.is_alive():
             warnings.warn(
                 f"the camera gave no more images before the motion was over: {self._folder}", stacklevel=2

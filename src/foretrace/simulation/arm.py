@@ -4,9 +4,6 @@ Denavit-Hartenberg parameters, masses, centres of mass, joint, speed and torque 
 Robots publishes for the UR10 (CB3). The links are drawn and collide as capsules.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 
 import mujoco
@@ -15,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions import Tool
 from foretrace.errors import ActionError
-from foretrace.geometry import matrix_to_pose
+from foretrace.geometry import matrix_to_pose, rigid_transform
 from foretrace.simulation.tool import TOOL_COLLISION, add_servo, add_tool
 
 NUM_JOINTS = 6
@@ -137,8 +134,7 @@ def add_arm(spec: mujoco.MjSpec, tool: Tool, tool_friction: float) -> None:
         mass=0.3,
         **TOOL_COLLISION,
     )
-    T = T_flange_tip(tool)
-    pose = matrix_to_pose(T)
+    pose = matrix_to_pose(T_flange_tip(tool))
     add_tool(holder, tool, tool_friction, pos=pose[:3], quat=pose[3:])
 
 
@@ -146,12 +142,8 @@ def T_flange_tip(tool: Tool) -> Float[np.ndarray, "4 4"]:
     """Tool frame in the flange frame: x along the tool, y to the left."""
     # At the flange y is the action's left; the tool's axis is the flange's axis turned up by HOLDER_ANGLE.
     c, s = np.cos(HOLDER_ANGLE), np.sin(HOLDER_ANGLE)
-    T = np.eye(4)
-    T[:3, 0] = [-s, 0, c]
-    T[:3, 1] = [0, 1, 0]
-    T[:3, 2] = [-c, 0, -s]
-    T[:3, 3] = np.array([0, 0, HOLDER_LENGTH]) + tool.length * T[:3, 0]
-    return T
+    axes = np.array([[-s, 0.0, -c], [0.0, 1.0, 0.0], [c, 0.0, -s]])
+    return rigid_transform(axes, np.array([0, 0, HOLDER_LENGTH]) + tool.length * axes[:, 0])
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,15 @@ from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.objects.body import Body
 from foretrace.simulation.bullet_world import World, connect
-from foretrace.simulation.engine import SPEED_LIMIT, STANDING_DEPTH, Engine, FreePlay, ToolMotion, sample_tool
+from foretrace.simulation.engine import (
+    SPEED_LIMIT,
+    STANDING_DEPTH,
+    Engine,
+    FreePlay,
+    ToolMotion,
+    check_divides,
+    sample_tool,
+)
 from foretrace.simulation.tool import TOUCH_MARGIN
 
 
@@ -62,11 +70,7 @@ class BulletEngine(Engine):
                 f"engine 'bullet' has no embodiment {embodiment!r}: "
                 "choose embodiment tool (--embodiment tool), or engine mujoco for the arm"
             )
-        ratio = sample_period / timestep if timestep > 0 else 0.0
-        if not ratio >= 1 or abs(ratio - round(ratio)) > 1e-9:
-            raise SimulationError(
-                f"timestep = {timestep} s does not divide {sample_period} s: take 0.002 s or a half of it"
-            )
+        check_divides(timestep, sample_period)
         connect()
         self.timestep, self.sample_period = timestep, sample_period
 

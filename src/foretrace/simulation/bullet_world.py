@@ -17,7 +17,13 @@ from scipy.spatial import ConvexHull
 
 from foretrace.actions import Tool
 from foretrace.errors import SimulationError
-from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
+from foretrace.geometry import (
+    invert_transform,
+    matrix_to_pose,
+    pose_to_matrix,
+    rigid_transform,
+    transform_points,
+)
 from foretrace.objects import CollisionShape, CylinderShape, HullShape
 from foretrace.objects.body import Body
 from foretrace.simulation.scene import TABLE_HEIGHT, TABLE_SIZE, TABLE_THICKNESS
@@ -137,8 +143,7 @@ class World:
         """
         inertia, axes = np.linalg.eigh(body.mass.inertia)
         axes[:, 0] *= np.sign(np.linalg.det(axes))
-        frame = np.eye(4)
-        frame[:3, :3], frame[:3, 3] = axes, body.mass.com
+        frame = rigid_transform(axes, body.mass.com)
         pose = matrix_to_pose(T_world_object @ frame)
         with tempfile.TemporaryDirectory() as folder:
             number = self.bullet.createMultiBody(
@@ -164,24 +169,13 @@ class World:
             Its number.
         """
         b, parts = self.bullet, tool.parts()
-        boxes = [part.shape == "box" for part in parts]
-        ends = [np.array([part.start, part.end]) for part in parts]
         shape = b.createCollisionShapeArray(
-            shapeTypes=[b.GEOM_BOX if box else b.GEOM_CAPSULE for box in boxes],
-            halfExtents=[part.end if box else [0, 0, 0] for part, box in zip(parts, boxes, strict=True)],
+            shapeTypes=[b.GEOM_BOX if part.shape == "box" else b.GEOM_CAPSULE for part in parts],
+            halfExtents=[part.end if part.shape == "box" else [0, 0, 0] for part in parts],
             radii=[part.radius for part in parts],
-            lengths=[
-                0 if box else float(np.linalg.norm(end[0] - end[1]))
-                for end, box in zip(ends, boxes, strict=True)
-            ],
-            collisionFramePositions=[
-                part.start if box else (end.sum(axis=0) / 2).tolist()
-                for part, end, box in zip(parts, ends, boxes, strict=True)
-            ],
-            collisionFrameOrientations=[
-                [0, 0, 0, 1] if box else _turn_from_z(end[0] - end[1])
-                for end, box in zip(ends, boxes, strict=True)
-            ],
+            lengths=[part.length for part in parts],
+            collisionFramePositions=[part.pose[:3].tolist() for part in parts],
+            collisionFrameOrientations=[part.pose[[4, 5, 6, 3]].tolist() for part in parts],
         )
         number = b.createMultiBody(TOOL_MASS, shape)
         self._surface(number, friction)
@@ -252,15 +246,6 @@ class World:
         file = folder / "pieces.obj"
         file.write_text(_wavefront(hulls), encoding="ascii")
         return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
-
-
-def _turn_from_z(direction: Float[np.ndarray, " 3"]) -> list[float]:
-    """Quaternion (x, y, z, w) that turns the z axis into a direction."""
-    x, y, z = direction / np.linalg.norm(direction)
-    across = float(np.hypot(x, y))
-    axis = [-y / across, x / across] if across else [1.0, 0.0]
-    half_sine = float(np.sqrt((1 - z) / 2))
-    return [half_sine * axis[0], half_sine * axis[1], 0.0, float(np.sqrt((1 + z) / 2))]
 
 
 def _convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:

@@ -1,8 +1,5 @@
 """A simulated RGB-D camera above the table, about as good as a Kinect's."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 import ctypes
 import os
 import sys
@@ -16,7 +13,7 @@ from mujoco.rendering.classic import gl_context
 
 from foretrace.actions import Action, Screwdriver
 from foretrace.errors import SimulationError
-from foretrace.geometry import matrix_to_pose, planar_transform
+from foretrace.geometry import matrix_to_pose, matrix_to_quaternion, planar_transform, rigid_transform
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Physics
 from foretrace.interactions.topdown import TopDownView
@@ -25,6 +22,8 @@ from foretrace.simulation.scene import body_origin, build_scene
 
 MINIMAL_HEIGHT = 0.008
 """Points lower than this are the table's, noise included [m]."""
+CAMERA = "camera"
+"""Name of the camera in a scene."""
 
 
 @dataclass(frozen=True)
@@ -74,24 +73,40 @@ def take_rgbd(
     """
     camera = config.camera
     spec = build_scene(obj, Physics(), Screwdriver(), None, timestep=0.002)
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = camera.width, camera.height
-    # MuJoCo's camera has y up and looks along -z: turned so that the action points up in the image.
-    spec.worldbody.add_camera(name="above", pos=config.position, quat=[np.sqrt(0.5), 0, 0, -np.sqrt(0.5)])
-    model = spec.compile()
-    model.cam_fovy[0] = np.rad2deg(2 * np.arctan(camera.height / 2 / camera.fy))
+    # The image's rows run along -x and its columns along -y of the action frame, as in the top-down view.
+    axes = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    T_action_camera = rigid_transform(axes, config.position)
+    model = compile_with_camera(spec, T_action_camera, camera.height, camera.width, camera.fy)
     data = mujoco.MjData(model)
     data.qpos[:7] = matrix_to_pose(action.T_action_object @ planar_transform(body_origin(obj), 0.0))
     mujoco.mj_forward(model, data)
     with make_renderer(model, camera.height, camera.width) as renderer:
-        rgb = render(renderer, data, "above")
-        depth = render(renderer, data, "above", depth=True).astype(float)
+        rgb = render(renderer, data)
+        depth = render(renderer, data, depth=True).astype(float)
     sigma = config.noise * (0.0012 + 0.0019 * (depth - 0.4) ** 2)
     depth += np.random.default_rng(seed).normal(size=depth.shape) * sigma
-    T = np.eye(4)
-    # The image's rows run along -x and its columns along -y of the action frame, as in the top-down view.
-    T[:3, :3] = [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
-    T[:3, 3] = config.position
-    return RgbdFrame(rgb, depth, camera, T)
+    return RgbdFrame(rgb, depth, camera, T_action_camera)
+
+
+def compile_with_camera(
+    spec: mujoco.MjSpec, T_world_camera: Float[np.ndarray, "4 4"], height: int, width: int, fy: float
+) -> mujoco.MjModel:
+    """A compiled scene with a camera in it.
+
+    Args:
+        spec: The scene.
+        T_world_camera: Pose of the camera (x right, y down, z forward).
+        height: Rows of the image.
+        width: Columns of the image.
+        fy: Focal length along the rows [pixel].
+    """
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    # MuJoCo's camera has y up and looks along -z.
+    turned = matrix_to_quaternion(T_world_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
+    spec.worldbody.add_camera(name=CAMERA, pos=T_world_camera[:3, 3], quat=turned)
+    model = spec.compile()
+    model.cam_fovy[model.camera(CAMERA).id] = np.rad2deg(2 * np.arctan(height / 2 / fy))
+    return model
 
 
 def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
@@ -123,18 +138,17 @@ def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
 
 
 def render(
-    renderer: mujoco.Renderer, data: mujoco.MjData, camera: str, *, depth: bool = False, shadows: bool = False
+    renderer: mujoco.Renderer, data: mujoco.MjData, *, depth: bool = False, shadows: bool = False
 ) -> Shaped[np.ndarray, "rows columns *channels"]:
-    """One image of a scene: red, green and blue, or distance along the optical axis [m].
+    """One image of a scene by its `compile_with_camera`: red, green and blue, or distance along the optical axis [m].
 
     Args:
         renderer: The renderer.
         data: State of the scene.
-        camera: Name of the camera.
         depth: Render depth instead of colour.
         shadows: Let the scene's lamps cast shadows.
     """
-    renderer.update_scene(data, camera=camera)
+    renderer.update_scene(data, camera=CAMERA)
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
     if not depth:

@@ -18,8 +18,8 @@ import numpy as np
 import pyarrow as pa
 from rich.console import Console
 
-from foretrace.actions import LeverUp, Screwdriver, ToolPath
-from foretrace.errors import DatasetError, ForetraceError, SimulationError
+from foretrace.actions import Action, LeverUp, Screwdriver, ToolPath
+from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_ranges
 from foretrace.files import LOCK, as_json, first_difference, remove_partial, sole_writer, versions_of
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import count_outcomes
@@ -57,30 +57,26 @@ class CollectConfig:
     recipe: str = "paper"
     """Kind of objects. paper: prisms. solids: lying cylinders, boxes and flat prisms, always three with one outline.
     mixed: prisms and solids. everyday: the same with prisms of many sizes, and flat objects with round, organic and
-    dented outlines."""
+    dented outlines. Other packages may add objects and actions of their own."""
     randomisation: Randomisation = NOTHING
     """What is drawn anew for every lever-up."""
     path: ToolPath = field(default_factory=ToolPath)
-    """Path of the blade."""
+    """Path of the blade in lever-ups."""
     tool: Screwdriver = field(default_factory=Screwdriver)
     """The screwdriver."""
 
     def __post_init__(self) -> None:
-        for name in ("objects", "contacts_per_edge"):
-            if not 1 <= getattr(self, name) <= MOST:
-                raise SimulationError(f"{name} is {getattr(self, name)}: give a number from 1 to {MOST}")
-        if self.seed < 0:
-            raise SimulationError(f"seed is {self.seed}, it must not be negative")
-        if self.recipe not in RECIPES:
-            raise SimulationError(f"recipe {self.recipe!r} is unknown: choose one of {', '.join(RECIPES)}")
+        limits = {"objects": (1, MOST), "contacts_per_edge": (1, MOST), "seed": (0, np.inf)}
+        check_ranges(SimulationError, "data set", self, limits, "give a whole number in this range")
+        RECIPES.find(self.recipe)
 
 
 def num_trials(config: CollectConfig) -> int:
     """Number of lever-ups that the configuration asks for; 2080 for the paper's 160 objects."""
-    return _first_contacts(config.recipe, config.objects, config.contacts_per_edge)[-1]
+    return _first_actions(config.recipe, config.objects, config.contacts_per_edge)[-1]
 
 
-def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, LeverUp, int]:
+def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, Action, int]:
     """Object, action and simulation seed of one trial, before anything is varied.
 
     Raises:
@@ -91,7 +87,10 @@ def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, LeverUp, int]:
     object_index, contact_index = _locate(config, id)
     obj, actions = _object_and_actions(config.recipe, config.seed, object_index, config.contacts_per_edge)
     seed = np.random.SeedSequence([config.seed, object_index, contact_index]).generate_state(1)[0]
-    return obj, replace(actions[contact_index], path=config.path, tool=config.tool), int(seed)
+    action = actions[contact_index]
+    if isinstance(action, LeverUp):
+        action = replace(action, path=config.path, tool=config.tool)
+    return obj, action, int(seed)
 
 
 def simulate_trial(config: CollectConfig, id: int) -> Interaction:
@@ -103,18 +102,22 @@ def simulate_trial(config: CollectConfig, id: int) -> Interaction:
         np.random.SeedSequence([config.seed, *_locate(config, id), RANDOMISATION_STREAM])
     )
     obj, physics, path, error = config.randomisation.vary(obj, config.simulation.physics, config.path, rng)
-    simulation, action = replace(config.simulation, physics=physics), replace(action, path=path)
+    simulation = replace(config.simulation, physics=physics)
+    if isinstance(action, LeverUp):
+        action = replace(action, path=path)
+    elif path != config.path:
+        raise SimulationError(f"the path of a {action.label} cannot be varied: only that of a lever-up can")
     return lever_up.simulate_lever_up(obj, action, simulation, seed=seed, id=id, execution_error=error)
 
 
 def _locate(config: CollectConfig, id: int) -> tuple[int, int]:
     """Which object a trial levers, and at which of its contact points."""
-    firsts = _first_contacts(config.recipe, config.objects, config.contacts_per_edge)
+    firsts = _first_actions(config.recipe, config.objects, config.contacts_per_edge)
     object_index = bisect_right(firsts, id) - 1
     return object_index, id - firsts[object_index]
 
 
-_first_contacts = lru_cache(maxsize=4)(recipes.first_contacts)
+_first_actions = lru_cache(maxsize=4)(recipes.first_actions)
 _object_and_actions = lru_cache(maxsize=64)(recipes.object_and_actions)
 
 

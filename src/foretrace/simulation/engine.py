@@ -107,6 +107,19 @@ def make_engine(name: str, embodiment: str, timestep: float, sample_period: floa
     return ENGINES.find(name)(embodiment, timestep, sample_period)
 
 
+def check_divides(timestep: float, *periods: float) -> None:
+    """Refuse a time step [s] of which periods [s] are no multiples.
+
+    Raises:
+        SimulationError: Naming both.
+    """
+    for period in periods:
+        if not 0 < timestep <= period or abs(period / timestep - round(period / timestep)) > 1e-9:
+            raise SimulationError(
+                f"timestep = {timestep} s does not divide {period} s: take 0.002 s or a half of it"
+            )
+
+
 def sample_tool(tool_motion: ToolMotion, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 6"]:
     """A tool's motion at given times [s], checked.
 

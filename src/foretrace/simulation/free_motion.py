@@ -13,6 +13,7 @@ from foretrace.geometry import Numbers, continuous_quaternions
 from foretrace.interactions.motions import ContactParameters
 from foretrace.objects.body import Body
 from foretrace.simulation.engine import ENGINES
+from foretrace.trajectories import interpolate
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class FreeMotion:
     def at(self, times: Float[np.ndarray, " sample"]) -> "FreeMotion":
         """The motion at other times, interpolated between two steps."""
         columns = np.concatenate([self.poses, self.velocities], axis=1)
-        values = np.column_stack([np.interp(times, self.times, column) for column in columns.T])
+        values = interpolate(self.times, columns, times)
         values[:, 3:7] /= np.linalg.norm(values[:, 3:7], axis=1, keepdims=True)
         return FreeMotion(np.asarray(times, dtype=float), values[:, :7], values[:, 7:])
 

@@ -1,8 +1,5 @@
 """A simulated camera with its faults: distortion, defocus, noise, changing light, depth that errs."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -12,9 +9,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foretrace.geometry import matrix_to_quaternion
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.simulation.camera import make_renderer, render
+from foretrace.simulation.camera import compile_with_camera, make_renderer, render
 
 WEBCAM = PinholeCamera(1280, 720, 921.0, 922.5, 648.0, 351.0, distortion=(0.09, -0.21, 0.0008, -0.0006, 0.11))
 """About what the colour camera of a depth camera has: 70 x 43 degrees, a lens of its time."""
@@ -65,13 +61,10 @@ class LensCamera:
         width, height = (2 * int(np.ceil(half)) + 4 for half in reach)
         ideal = camera.fy * rays[:, :2] + [(width - 1) / 2, (height - 1) / 2]
         self._maps = [values.reshape(camera.height, camera.width).astype(np.float32) for values in ideal.T]
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-        # MuJoCo's camera has y up and looks along -z.
-        turned = matrix_to_quaternion(T_world_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
-        spec.worldbody.add_camera(name="lens", pos=T_world_camera[:3, 3], quat=turned)
-        self.camera, self.model, self._lamp = camera, spec.compile(), lamp
-        """Intrinsics, and the compiled scene."""
-        self.model.cam_fovy[self.model.camera("lens").id] = np.rad2deg(2 * np.arctan(height / 2 / camera.fy))
+        self.camera, self._lamp = camera, lamp
+        """Intrinsics."""
+        self.model = compile_with_camera(spec, T_world_camera, height, width, camera.fy)
+        """The compiled scene."""
         self.data = mujoco.MjData(self.model)
         """State of the scene."""
         self._renderer = make_renderer(self.model, height, width)
@@ -97,7 +90,7 @@ class LensCamera:
 
     def _render(self, **what: bool) -> np.ndarray:
         mujoco.mj_forward(self.model, self.data)
-        return render(self._renderer, self.data, "lens", **what).astype(np.float32)
+        return render(self._renderer, self.data, **what).astype(np.float32)
 
     def _bend(self, image: np.ndarray, interpolation: int) -> Any:
         return cv2.remap(image, self._maps[0], self._maps[1], interpolation)

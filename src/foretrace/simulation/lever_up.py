@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import FAILED, Action, Motion, ToolPath
-from foretrace.errors import ActionError, SimulationError
+from foretrace.errors import ActionError, SimulationError, check_ranges
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -32,6 +32,7 @@ from foretrace.simulation.engine import make_engine
 CAMERAS = ("exact", "rgbd")
 PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
 """What is simulated: friction coefficients, densities of anything solid [kg/m^3]."""
+LEVER_ARM = "it is a lever arm in metres, a tenth of a millimetre on a hard table"
 FALL_DEPTH = 0.5
 """The record of a falling object ends this far below the table top, above the floor [m]."""
 
@@ -56,20 +57,11 @@ class SimulationConfig:
     """Friction and density."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.watch_time <= 60:
-            raise SimulationError(f"watch_time = {self.watch_time} s is outside 0 to 60 s")
+        check_ranges(SimulationError, "simulation", self, {"watch_time": (0.0, 60.0)}, "give seconds")
+        check_ranges(SimulationError, "physics", self.physics, PHYSICS_RANGES, "check its unit")
+        check_ranges(SimulationError, "physics", self.physics, {"rolling_friction": (0.0, 0.1)}, LEVER_ARM)
         if self.physics.table_edge is not None and not 0 < self.physics.table_edge <= 10:
             raise SimulationError(f"table_edge = {self.physics.table_edge} m: give a distance up to 10 m")
-        if not 0 <= self.physics.rolling_friction <= 0.1:
-            raise SimulationError(
-                f"rolling_friction = {self.physics.rolling_friction} m is outside 0 to 0.1 m: "
-                "it is a lever arm, a tenth of a millimetre on a hard table"
-            )
-        for name, (low, high) in PHYSICS_RANGES.items():
-            if not low <= getattr(self.physics, name) <= high:
-                raise SimulationError(
-                    f"{name} = {getattr(self.physics, name)} is outside {low:g} to {high:g}: check its unit"
-                )
         make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
         if self.camera not in CAMERAS:
             raise SimulationError(f"camera {self.camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
@@ -204,33 +196,14 @@ def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics
         action: The executed action.
         physics: Friction and density.
     """
-    unknown = np.full((2, 2), np.nan)
     if motion.diverged:
-        empty = np.empty((0, 7))
+        empty, unknown = np.empty((0, 7)), np.full((2, 2), np.nan)
         joints = np.empty((0, motion.joints.shape[1]))
         return Effect(np.empty(0), empty, np.empty((0, 3)), empty, joints, unknown, (), FAILED)
     motion, fall = _until_the_floor(motion, obj, physics)
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
     com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
-    judgement = action.judge(motion, obj, com)
-    if judgement.outcome not in action.outcomes:
-        raise SimulationError(
-            f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
-            f"{', '.join(action.outcomes)}"
-        )
-    return Effect(
-        times=motion.times,
-        pose_trajectory=motion.object_pose,
-        com_trajectory=com,
-        tool_trajectory=motion.tool_pose,
-        joint_trajectory=motion.joints,
-        support_points=unknown if judgement.support_points is None else judgement.support_points,
-        support_corners=judgement.support_corners,
-        outcome=judgement.outcome,
-        slip_index=judgement.slip_index,
-        fall_index=fall,
-        path_error=motion.path_error,
-    )
+    return Effect.judged(motion, obj, action, com, fall)
 
 
 def _transformed(effect: Effect, T_commanded_executed: Float[np.ndarray, "4 4"]) -> Effect:

@@ -4,9 +4,6 @@ An action is open loop, so every set point is known before the first step: one c
 the whole interaction in C. Contacts are read afterwards, at the recorded samples only.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -18,7 +15,7 @@ from mujoco import rollout
 
 from foretrace.actions import Motion, Tool, tool_transforms
 from foretrace.errors import SimulationError
-from foretrace.geometry import matrix_to_pose
+from foretrace.geometry import matrix_to_pose, planar_transform
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
 from foretrace.simulation import arm
@@ -27,6 +24,7 @@ from foretrace.simulation.engine import (
     STANDING_DEPTH,
     Engine,
     ToolMotion,
+    check_divides,
     sample_tool,
     used_coordinates,
 )
@@ -71,11 +69,7 @@ class MujocoEngine(Engine):
             raise SimulationError(
                 f"embodiment {embodiment!r} is unknown: choose one of {', '.join(EMBODIMENTS)}"
             )
-        for period in (sample_period, arm.CONTROL_PERIOD):
-            if not 0 < timestep <= period or abs(period / timestep - round(period / timestep)) > 1e-9:
-                raise SimulationError(
-                    f"timestep = {timestep} s does not divide {period} s: take 0.002 s or a half of it"
-                )
+        check_divides(timestep, sample_period, arm.CONTROL_PERIOD)
         self.embodiment, self.timestep, self.sample_period = embodiment, timestep, sample_period
         self._kept: tuple[Any, ObjectModel, mujoco.MjModel, mujoco.MjData] | None = None
 
@@ -96,9 +90,7 @@ class MujocoEngine(Engine):
         control = plan(tool_motion, samples, tool, num_samples * stride, self.timestep)
         model, data = self._compiled(obj, physics, tool, control.coordinates)
         mujoco.mj_resetData(model, data)
-        T_object_body = np.eye(4)
-        T_object_body[:3, 3] = body_origin(obj)
-        data.qpos[:7] = matrix_to_pose(T_action_object @ T_object_body)
+        data.qpos[:7] = matrix_to_pose(T_action_object @ planar_transform(body_origin(obj), 0.0))
         data.qpos[7:] = control.start
         state = np.empty(mujoco.mj_stateSize(model, STATE))
         mujoco.mj_getState(model, data, state, STATE)

@@ -1,20 +1,17 @@
 """Free motion in MuJoCo, on the table of the lever-ups."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 import mujoco
 import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
 from foretrace.actions import Screwdriver
-from foretrace.geometry import matrix_to_pose, quaternion_to_matrix
+from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.motions import ContactParameters
 from foretrace.interactions.record import Physics
 from foretrace.objects import HullShape
 from foretrace.objects.body import Body
-from foretrace.simulation.scene import build_scene
+from foretrace.simulation.scene import add_shapes, build_scene
 from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -62,21 +59,9 @@ def _compile(body: Body, contact_parameters: ContactParameters, timestep: float)
     # Without a position MuJoCo drops the directions of the principal axes.
     part.mass, part.ipos, part.explicitinertial = body.mass.mass, np.zeros(3), True
     part.fullinertia = body.mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    for i, shape in enumerate(body.shapes):
-        if isinstance(shape, HullShape):
-            spec.add_mesh(name=f"piece_{i}", uservert=np.asarray(shape.vertices, dtype=np.float32).ravel())
-            kind = mujoco.mjtGeom.mjGEOM_MESH
-            part.add_geom(type=kind, meshname=f"piece_{i}", pos=-body.mass.com, **surface)
-        else:
-            place = matrix_to_pose(shape.T_object_shape)
-            part.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-                pos=place[:3] - body.mass.com,
-                quat=place[3:],
-                size=[shape.radius, shape.length / 2, 0.0],
-                condim=6 if contact_parameters.rolling_friction > 0 else 3,
-                **surface,
-            )
+    # Rolling friction is for cylinders: boxes and hulls do not roll.
+    rolls = contact_parameters.rolling_friction > 0 and not any(isinstance(s, HullShape) for s in body.shapes)
+    add_shapes(spec, part, body.shapes, body.mass.com, condim=6 if rolls else 3, **surface)
     return spec.compile()
 
 

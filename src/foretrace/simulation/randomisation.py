@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from foretrace.actions import CONTACT_TOLERANCE, ToolPath
-from foretrace.errors import SimulationError
+from foretrace.errors import SimulationError, check_ranges
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.objects import Bevel, Box, ObjectModel, Prism
 
@@ -70,11 +70,8 @@ class Randomisation:
                     f"randomisation: {name} = {low} to {high} is no range of possible values: "
                     "give a least one above 0 and a greatest one"
                 )
-        for name, limit in LARGEST.items():
-            if not 0 <= getattr(self, name) <= limit:
-                raise SimulationError(
-                    f"randomisation: {name} = {getattr(self, name)} is outside 0 to {limit:g} (SI units)"
-                )
+        limits = {name: (0.0, limit) for name, limit in LARGEST.items()}
+        check_ranges(SimulationError, "randomisation", self, limits)
 
     def vary(
         self, obj: ObjectModel, physics: Physics, path: ToolPath, rng: np.random.Generator

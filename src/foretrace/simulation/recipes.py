@@ -1,15 +1,18 @@
-"""Which objects a data set holds, and where they are levered.
+"""Which objects a data set holds, and how each of them is acted on.
 
 An object is known by its number alone, so that any worker can make it, and more objects begin with the same ones.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 
-from foretrace.actions import LeverUp, sample_contacts, sample_reachable_contacts
+from foretrace.actions import Action, LeverUp, sample_contacts, sample_reachable_contacts
+from foretrace.errors import SimulationError
 from foretrace.objects import (
     CORNER_COUNTS,
     ObjectModel,
@@ -22,6 +25,7 @@ from foretrace.objects import (
     sample_rounded,
     sample_sized_prism,
 )
+from foretrace.registry import Registry
 
 LOOK_ALIKES = 3
 """Objects that share one outline."""
@@ -33,20 +37,38 @@ ROUND: dict[str, Callable[[np.random.Generator], Prism]] = {
 }
 """Families of flat objects without edges to count, and how one of each is drawn."""
 ROUND_EDGES = 4
-"""They are levered at as many points as an object of so many edges."""
-RECIPES = {
-    "paper": ("prism",),
-    "solids": ("alike",) * LOOK_ALIKES,
-    "mixed": ("prism",) * 2 + ("alike",) * LOOK_ALIKES,
-    "everyday": ("sized",) * 3 + ("alike",) * LOOK_ALIKES + tuple(ROUND),
-}
-"""Families that take turns. ``prism``: random prisms of 3 to 10 corners (section 4). ``alike``: a lying cylinder, a box
-and a flat prism with one outline, levered at the same points (section 5.5). ``sized``: prisms of other sizes and
-heights. The others are `ROUND`."""
+"""Number of edges that count for them."""
 SOLID_STREAM = 1
 """Tells the random numbers of the solids from those of prisms with the same number."""
 EVERYDAY_STREAM = 3
 """Tells the random numbers of the sized prisms and round objects from those of the others."""
+
+
+class Recipe(ABC):
+    """Objects and actions of a data set; both depend on the arguments alone, so that any worker can make them."""
+
+    @abstractmethod
+    def count(self, object_index: int, per_edge: int) -> int:
+        """Number of actions on an object.
+
+        Args:
+            object_index: Number of the object.
+            per_edge: Actions at each edge that are asked for; what counts as an edge is up to the recipe.
+        """
+
+    @abstractmethod
+    def make(self, seed: int, object_index: int, per_edge: int) -> tuple[ObjectModel, Sequence[Action]]:
+        """An object and its actions, as many as `count` has.
+
+        Args:
+            seed: Seed of the data set.
+            object_index: Number of the object.
+            per_edge: As `count` has it.
+        """
+
+
+RECIPES: Registry[Recipe] = Registry("recipe", "foretrace.recipes", SimulationError)
+"""Every recipe by its name; other packages add theirs."""
 
 
 class _Place(NamedTuple):
@@ -61,46 +83,67 @@ class _Place(NamedTuple):
     """How many of its own family come before it in all."""
 
 
-def _place(recipe: str, object_index: int) -> _Place:
-    families = RECIPES[recipe]
-    turn, k = divmod(object_index, len(families))
-    member = families[:k].count(families[k])
-    return _Place(families[k], turn, member, families.count(families[k]) * turn + member)
+@dataclass(frozen=True)
+class Families(Recipe):
+    """Lever-ups of objects whose families take turns."""
+
+    families: tuple[str, ...]
+    """``prism``: random prisms of 3 to 10 corners (section 4). ``alike``: a lying cylinder, a box and a flat prism with
+    one outline, levered at the same points (section 5.5). ``sized``: prisms of other sizes and heights. The others are
+    `ROUND`."""
+
+    def count(self, object_index: int, per_edge: int) -> int:
+        """Number of lever-ups of an object."""
+        return per_edge * self.num_edges(object_index)
+
+    def num_edges(self, object_index: int) -> int:
+        """Edges at which an object is levered, or as many as count for a round one.
+
+        The prisms' counts take turns, so that any number of objects is spread evenly.
+        """
+        place = self._place(object_index)
+        if place.family in ("prism", "sized"):
+            return CORNER_COUNTS[place.number % len(CORNER_COUNTS)]
+        return ROUND_EDGES
+
+    def make(self, seed: int, object_index: int, per_edge: int) -> tuple[ObjectModel, list[LeverUp]]:
+        """An object and its lever-ups; objects with one outline are levered at the same points."""
+        place, edges = self._place(object_index), self.num_edges(object_index)
+        family = place.family
+        numbers = {"prism": [object_index], "alike": [place.turn, SOLID_STREAM]}
+        stream = numbers.get(family, [object_index, EVERYDAY_STREAM])
+        rng = np.random.default_rng(np.random.SeedSequence([seed, *stream]))
+        if family in ROUND:
+            obj = ROUND[family](rng)
+            return obj, sample_reachable_contacts(obj, rng, per_edge * edges)
+        if family == "alike":
+            alike = sample_look_alikes(rng)
+            obj, levered = alike[place.member], alike[0]
+        else:
+            obj = levered = (sample_prism if family == "prism" else sample_sized_prism)(rng, edges)
+        return obj, sample_contacts(levered, rng, per_edge=per_edge)
+
+    def _place(self, object_index: int) -> _Place:
+        turn, k = divmod(object_index, len(self.families))
+        family = self.families[k]
+        member = self.families[:k].count(family)
+        return _Place(family, turn, member, self.families.count(family) * turn + member)
 
 
-def num_edges(recipe: str, object_index: int) -> int:
-    """Edges at which an object is levered, or as many as count for a round one.
-
-    The prisms' counts take turns, so that any number of objects is spread evenly.
-    """
-    place = _place(recipe, object_index)
-    if place.family in ("prism", "sized"):
-        return CORNER_COUNTS[place.number % len(CORNER_COUNTS)]
-    return ROUND_EDGES
+RECIPES.add("paper", Families(("prism",)))
+RECIPES.add("solids", Families(("alike",) * LOOK_ALIKES))
+RECIPES.add("mixed", Families(("prism",) * 2 + ("alike",) * LOOK_ALIKES))
+RECIPES.add("everyday", Families(("sized",) * 3 + ("alike",) * LOOK_ALIKES + tuple(ROUND)))
 
 
-def first_contacts(recipe: str, objects: int, contacts_per_edge: int) -> list[int]:
-    """Number of the first lever-up of each object, and at the end how many there are in all."""
-    counts = (contacts_per_edge * num_edges(recipe, k) for k in range(objects))
+def first_actions(recipe: str, objects: int, per_edge: int) -> list[int]:
+    """Number of the first action on each object, and at the end how many there are in all."""
+    counts = (RECIPES[recipe].count(k, per_edge) for k in range(objects))
     return list(accumulate(counts, initial=0))
 
 
 def object_and_actions(
-    recipe: str, seed: int, object_index: int, contacts_per_edge: int
-) -> tuple[ObjectModel, list[LeverUp]]:
-    """An object and its lever-ups; objects with one outline are levered at the same points."""
-    place, edges = _place(recipe, object_index), num_edges(recipe, object_index)
-    if place.family == "alike":
-        rng = np.random.default_rng(np.random.SeedSequence([seed, place.turn, SOLID_STREAM]))
-        alike = sample_look_alikes(rng)
-        return alike[place.member], sample_contacts(alike[0], rng, per_edge=contacts_per_edge)
-    if place.family == "prism":
-        rng = np.random.default_rng(np.random.SeedSequence([seed, object_index]))
-        prism = sample_prism(rng, edges)
-        return prism, sample_contacts(prism, rng, per_edge=contacts_per_edge)
-    rng = np.random.default_rng(np.random.SeedSequence([seed, object_index, EVERYDAY_STREAM]))
-    if place.family == "sized":
-        prism = sample_sized_prism(rng, edges)
-        return prism, sample_contacts(prism, rng, per_edge=contacts_per_edge)
-    obj = ROUND[place.family](rng)
-    return obj, sample_reachable_contacts(obj, rng, contacts_per_edge * edges)
+    recipe: str, seed: int, object_index: int, per_edge: int
+) -> tuple[ObjectModel, Sequence[Action]]:
+    """An object of a recipe and its actions."""
+    return RECIPES[recipe].make(seed, object_index, per_edge)

@@ -1,8 +1,5 @@
 """Recordings of simulated lever-ups, with markers on object and table, as a camera above a table takes them."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,13 +12,14 @@ import shapely
 from jaxtyping import Float, UInt8
 
 from foretrace.actions import LeverUp, Motion
-from foretrace.errors import SimulationError
+from foretrace.errors import SimulationError, check_ranges
 from foretrace.files import write_json
 from foretrace.geometry import (
     invert_transform,
     matrix_to_pose,
     planar_transform,
     pose_to_matrix,
+    rigid_transform,
     transform_points,
 )
 from foretrace.interactions import recording_folder
@@ -34,6 +32,7 @@ from foretrace.simulation.lens import SLAB, WEBCAM, Faults, LensCamera, add_imag
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.scene import body_origin, build_scene
 from foretrace.simulation.stage import ObjectColour, TableTop, cast_shadows, set_stage
+from foretrace.trajectories import interpolate
 
 DICTIONARY = "apriltag_36h11"
 MODULES = 8
@@ -50,8 +49,8 @@ X_Z_PITCH = (0, 2, 4)
 OUT_OF_SIGHT = (0.0, 0.0, -5.0)
 FAULTS = Faults()
 """The nominal ones."""
+WIDTH_RANGE = {"width": (64, 7680)}
 RANGES = {
-    "width": (64, 7680),
     "distance": (0.1, 10.0),
     "slant": (0.0, 1.5),
     "azimuth": (-10.0, 10.0),
@@ -61,7 +60,8 @@ RANGES = {
     "exposures": (1, 100),
     "depth_every": (0, 1_000_000),
 }
-"""What can be recorded. Beyond, images do not fit into memory, or the camera is below the table or in the object."""
+"""What can be recorded."""
+WITHIN = "beyond, images do not fit into memory, or the camera is below the table or in the object"
 
 
 @dataclass(frozen=True)
@@ -105,12 +105,8 @@ class RecordingConfig:
     def __post_init__(self) -> None:
         if self.simulation.engine != "mujoco":
             raise SimulationError(f"engine {self.simulation.engine!r} cannot record: take mujoco")
-        given = {"width": self.camera.width}
-        given |= {name: getattr(self, name) for name in RANGES if name != "width"}
-        for name, value in given.items():
-            low, high = RANGES[name]
-            if not low <= value <= high:
-                raise SimulationError(f"film: {name} = {value}, give a number from {low:g} to {high:g}")
+        check_ranges(SimulationError, "film", self.camera, WIDTH_RANGE, WITHIN)
+        check_ranges(SimulationError, "film", self, RANGES, WITHIN)
 
 
 @dataclass(frozen=True)
@@ -187,14 +183,12 @@ def record_lever_up(
     lamp = cast_shadows(spec, np.random.default_rng([seed, 2])) if config.shadows else None
     action_start = round(float(rng.uniform(5.0, 50.0)), 3)
     times = _frame_times(action, action_start, config)
-    poses = _interpolate(motion, times - action_start)[0]
+    poses = _poses_at(motion, motion.object_pose, times - action_start)
     with LensCamera(spec, config.camera, T_action_camera, lamp) as lens:
         folder.mkdir(parents=True, exist_ok=True)
-        recording_folder.write_image(
-            folder / recording_folder.BACKGROUND, _background(lens, obj, motion, config, rng)
-        )
-        frames = _frames(lens, obj, motion, times, action_start, config, rng)
-        write_recording(folder, frames, RecordingNotes(action_start=None))
+        take = _Take(lens, obj, motion, config, rng)
+        recording_folder.write_image(folder / recording_folder.BACKGROUND, take.background())
+        write_recording(folder, take.frames(times, action_start), RecordingNotes())
     truth = RecordingTruth(
         interaction,
         times,
@@ -259,10 +253,8 @@ def _held(camera: PinholeCamera, size: float, rng: np.random.Generator) -> Float
     pixel = rng.uniform([0.3, 0.3], [0.7, 0.7]) * [camera.width, camera.height]
     distance = rng.uniform(1.1, 1.9) * size * camera.fx / camera.width * 1.6
     turn, _ = cv2.Rodrigues(rng.uniform([-0.6, -0.6, -0.4], [0.6, 0.6, 0.4]))
-    pose = np.eye(4)
-    pose[:3, :3] = turn @ np.diag([1.0, -1.0, -1.0])  # the board faces the camera
-    pose[:3, 3] = distance * camera.rays(pixel[None])[0]
-    return pose
+    facing = turn @ np.diag([1.0, -1.0, -1.0])  # the board faces the camera
+    return rigid_transform(facing, distance * camera.rays(pixel[None])[0])
 
 
 def camera_pose(config: RecordingConfig) -> Float[np.ndarray, "4 4"]:
@@ -270,11 +262,9 @@ def camera_pose(config: RecordingConfig) -> Float[np.ndarray, "4 4"]:
     aim = np.array([0.08, 0.0, 0.0])
     horizontal = np.array([np.cos(config.azimuth), np.sin(config.azimuth), 0.0])
     away = np.sin(config.slant) * horizontal + np.array([0.0, 0.0, np.cos(config.slant)])
-    pose = np.eye(4)
     right = np.cross([0.0, 0.0, 1.0], horizontal)
-    pose[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
-    pose[:3, 3] = aim + config.distance * away
-    return pose
+    axes = np.column_stack([right, np.cross(-away, right), -away])
+    return rigid_transform(axes, aim + config.distance * away)
 
 
 def marker_spot(
@@ -336,58 +326,57 @@ def _layout(T_table_action: Float[np.ndarray, "4 4"], side: float, config: Recor
     return layout | {"table": table, "object": [{"id": OBJECT_ID, "side": side}]}
 
 
-def _interpolate(motion: Motion, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Object and tool poses between the engine's samples, at rest before the first and after the last."""
-    poses = []
-    for values in (motion.object_pose, motion.tool_pose):
-        mixed = np.column_stack([np.interp(times, motion.times, column) for column in values.T])
-        mixed[:, 3:] /= np.linalg.norm(mixed[:, 3:], axis=1, keepdims=True)
-        poses.append(mixed)
-    return poses[0], poses[1]
+def _poses_at(
+    motion: Motion, poses: Float[np.ndarray, "time 7"], times: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 7"]:
+    """Poses between the engine's samples, at rest before the first and after the last."""
+    mixed = interpolate(motion.times, poses, times)
+    mixed[:, 3:] /= np.linalg.norm(mixed[:, 3:], axis=1, keepdims=True)
+    return mixed
 
 
-def _frames(
-    lens: LensCamera,
-    obj: ObjectModel,
-    motion: Motion,
-    times: Float[np.ndarray, " frame"],
-    action_start: float,
-    config: RecordingConfig,
-    rng: np.random.Generator,
-) -> Iterator[Frame]:
-    phase = rng.uniform(0, 2 * np.pi)
-    offsets = 0.01 * (np.arange(config.exposures) - (config.exposures - 1) / 2) / config.exposures
-    for number, time in enumerate(times):
-        blended = np.zeros((lens.camera.height, lens.camera.width, 3), dtype=np.float32)
-        for offset in offsets:
-            _place(lens, obj, motion, time - action_start + offset)
-            blended += lens.colours() / config.exposures
-        light = np.sin(phase + 2 * np.pi * 0.3 * (time - times[0]))
-        image = spoil(blended, config.faults, float(light), rng)
-        depth = None
-        if config.depth_every and number % config.depth_every == 0:
-            _place(lens, obj, motion, time - action_start)
-            depth = spoil_depth(lens.depths(), config.faults, rng)
-        yield Frame(round(float(time), 6), image, depth)
+@dataclass(frozen=True)
+class _Take:
+    """A motion in front of a camera."""
 
+    lens: LensCamera
+    obj: ObjectModel
+    motion: Motion
+    config: RecordingConfig
+    rng: np.random.Generator
 
-def _background(
-    lens: LensCamera, obj: ObjectModel, motion: Motion, config: RecordingConfig, rng: np.random.Generator
-) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The table before the object was put there, in the mean of some images."""
-    _place(lens, obj, motion, 0.0)
-    lens.data.qpos[:3] = OUT_OF_SIGHT
-    perfect = lens.colours()
-    images = [spoil(perfect, config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
-    return np.rint(np.mean(images, axis=0)).astype(np.uint8)
+    def frames(self, times: Float[np.ndarray, " frame"], action_start: float) -> Iterator[Frame]:
+        """The motion, frame by frame."""
+        config, rng = self.config, self.rng
+        phase = rng.uniform(0, 2 * np.pi)
+        offsets = 0.01 * (np.arange(config.exposures) - (config.exposures - 1) / 2) / config.exposures
+        for number, time in enumerate(times):
+            blended = np.zeros((config.camera.height, config.camera.width, 3), dtype=np.float32)
+            for offset in offsets:
+                self.place(time - action_start + offset)
+                blended += self.lens.colours() / config.exposures
+            light = np.sin(phase + 2 * np.pi * 0.3 * (time - times[0]))
+            image = spoil(blended, config.faults, float(light), rng)
+            depth = None
+            if config.depth_every and number % config.depth_every == 0:
+                self.place(time - action_start)
+                depth = spoil_depth(self.lens.depths(), config.faults, rng)
+            yield Frame(round(float(time), 6), image, depth)
 
+    def background(self) -> UInt8[np.ndarray, "rows columns 3"]:
+        """The table before the object was put there, in the mean of some images."""
+        self.place(0.0)
+        self.lens.data.qpos[:3] = OUT_OF_SIGHT
+        perfect, rng = self.lens.colours(), self.rng
+        images = [spoil(perfect, self.config.faults, rng.uniform(-1, 1), rng) for _ in range(4)]
+        return np.rint(np.mean(images, axis=0)).astype(np.uint8)
 
-def _place(lens: LensCamera, obj: ObjectModel, motion: Motion, time: float) -> None:
-    """Puts object and tool where they are at a time since the path's start."""
-    pose, tool = (poses[0] for poses in _interpolate(motion, np.array([time])))
-    lens.data.qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(obj), 0.0))
-    if motion.joints.shape[1]:
-        joints = [np.interp(time, motion.times, joint) for joint in motion.joints.T]
-    else:
-        joints = [tool[0], tool[2], 2 * np.arctan2(tool[5], tool[3])]
-    lens.data.qpos[7:] = joints
+    def place(self, time: float) -> None:
+        """Puts object and tool where they are at a time since the path's start."""
+        motion, now, qpos = self.motion, np.array([time]), self.lens.data.qpos
+        pose, tool = (_poses_at(motion, poses, now)[0] for poses in (motion.object_pose, motion.tool_pose))
+        qpos[:7] = matrix_to_pose(pose_to_matrix(pose) @ planar_transform(body_origin(self.obj), 0.0))
+        if motion.joints.shape[1]:
+            qpos[7:] = interpolate(motion.times, motion.joints, now)[0]
+        else:
+            qpos[7:] = [tool[0], tool[2], 2 * np.arctan2(tool[5], tool[3])]

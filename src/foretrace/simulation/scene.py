@@ -4,10 +4,8 @@ The scene lies in the action frame, so the tool's path is the same for every obj
 contact point at the origin, the action's direction along x (paper, section 3.1).
 """
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,7 +14,7 @@ from jaxtyping import Float
 from foretrace.actions import Tool
 from foretrace.geometry import matrix_to_pose
 from foretrace.interactions.record import Physics
-from foretrace.objects import HullShape, ObjectModel
+from foretrace.objects import CollisionShape, HullShape, ObjectModel
 from foretrace.simulation.arm import add_arm
 from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT, TOOL_BIT, add_carriage
 
@@ -120,7 +118,26 @@ def _add_object(spec: mujoco.MjSpec, obj: ObjectModel, physics: Physics) -> None
     }
     if obj.is_round:
         surface |= {"friction": [physics.friction, 0.005, physics.rolling_friction], "condim": 6}
-    for i, shape in enumerate(obj.collision_shapes()):
+    add_shapes(spec, body, obj.collision_shapes(), origin, **surface)
+
+
+def add_shapes(
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    shapes: Sequence[CollisionShape],
+    origin: Float[np.ndarray, "3"],
+    **surface: Any,
+) -> None:
+    """Adds an object's collision shapes to a body.
+
+    Args:
+        spec: The scene.
+        body: The body.
+        shapes: The shapes, in the object frame.
+        origin: Where the body has its origin, in the object frame [m].
+        **surface: Fields of every geom.
+    """
+    for i, shape in enumerate(shapes):
         if isinstance(shape, HullShape):
             spec.add_mesh(name=f"piece_{i}", uservert=np.asarray(shape.vertices, dtype=np.float32).ravel())
             kind = mujoco.mjtGeom.mjGEOM_MESH

@@ -1,8 +1,5 @@
 """Surroundings of a recorded object: a lamp with soft shadows, a table with a pattern, the object's colour."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from typing import Literal
 
 import mujoco

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from foretrace.actions import CONTACT_TOLERANCE, LeverUp
-from foretrace.errors import SimulationError, ViewError
+from foretrace.errors import SimulationError, ViewError, check_ranges
 from foretrace.geometry import cross, pose_to_matrix, transform_points
 from foretrace.interactions.record import Effect, ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
@@ -24,7 +24,18 @@ from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.randomisation import Range
 
 LONGEST_STEP = 0.002
-"""Time steps of the physics are at most about so long [s]."""
+"""Largest time step of the physics, about [s]."""
+RANGES = {
+    "sample_rate": (1.0, 500.0),
+    "contact_error": (0.0, CONTACT_TOLERANCE),
+    "direction_error": (0.0, 0.5),
+    "view_shift": (0.0, 0.02),
+    "view_turn": (0.0, 0.5),
+    "frayed": (0.0, 1.0),
+    "marker_position": (0.0, 0.02),
+    "marker_rotation": (0.0, 0.5),
+}
+"""Limits of its settings."""
 
 
 @dataclass(frozen=True)
@@ -89,19 +100,11 @@ class StandIn:
     """Standard deviation of its rotation about each axis [rad]."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.sample_rate <= 500:
-            raise SimulationError(f"stand-in: sample_rate = {self.sample_rate} Hz is outside 1 to 500 Hz")
         for name in ("friction", "tool_friction", "density_factor", "thickness_error"):
             low, high = getattr(self, name)
             if not low <= high or (low <= 0 and name != "thickness_error"):
                 raise SimulationError(f"stand-in: {name} = {low} to {high} is no range of possible values")
-        limits = {"contact_error": CONTACT_TOLERANCE, "direction_error": 0.5, "view_shift": 0.02}
-        limits |= {"view_turn": 0.5, "frayed": 1.0, "marker_position": 0.02, "marker_rotation": 0.5}
-        for name, limit in limits.items():
-            if not 0 <= getattr(self, name) <= limit:
-                raise SimulationError(
-                    f"stand-in: {name} = {getattr(self, name)} is outside 0 to {limit:g} (SI units)"
-                )
+        check_ranges(SimulationError, "stand-in", self, RANGES)
         self.simulation(Physics())
 
     @classmethod

@@ -1,8 +1,5 @@
 """Tools in MuJoCo: their bodies, and the carriage that moves them alone."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo is a compiled module without type stubs.
-
 from collections.abc import Sequence
 
 import mujoco
