@@ -43,6 +43,9 @@ class Effect:
     path_error: float = 0.0
     """Largest distance of the tool's tip from its planned path [m]."""
 
+    def __repr__(self) -> str:
+        return f"Effect({self.outcome}, {len(self.times)} samples)"
+
 
 @dataclass(frozen=True)
 class Physics:
@@ -123,3 +126,10 @@ class Interaction:
     """Offset of the executed action from the commanded one."""
     id: int = 0
     """Number within its data set."""
+
+    def __repr__(self) -> str:
+        made = self.provenance
+        return (
+            f"Interaction({self.id}: {self.action.label} of a {self.object.kind}, {self.effect.outcome}, "
+            f"{len(self.effect.times)} samples, {made.source})"
+        )
