@@ -127,7 +127,10 @@ def test_dataset_slices_and_filters(folder):
         dataset.where(outcome=("levered", "sliped"))
     with pytest.raises(DatasetError, match="no interaction 13"):
         dataset.with_id(13)
-    for rows, message in {19: "row 19 of .* choose one of the 19", "a": "rows 'a' of .* give a number"}.items():
+    for rows, message in {
+        19: "row 19 of .* choose one of the 19",
+        "a": "rows 'a' of .* give a number",
+    }.items():
         with pytest.raises(DatasetError, match=message) as caught:
             dataset[rows]
         assert isinstance(caught.value, IndexError)

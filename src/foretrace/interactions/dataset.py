@@ -202,7 +202,9 @@ class Dataset:
         try:
             return self._view(np.arange(len(self))[rows])
         except IndexError as error:
-            raise RowError(f"rows {rows!r} of {self.path}: give a number, a slice or an array of numbers") from error
+            raise RowError(
+                f"rows {rows!r} of {self.path}: give a number, a slice or an array of numbers"
+            ) from error
 
     def __iter__(self) -> Iterator[Interaction]:
         for start in range(0, len(self), ROWS_AT_ONCE):

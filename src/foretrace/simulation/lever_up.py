@@ -180,7 +180,9 @@ def replay(interaction: Interaction) -> Interaction:
         SimulationError: The interaction is a recording of a real one, or its engine is not installed.
     """
     if not isinstance(interaction, Interaction):
-        raise SimulationError(f"{type(interaction).__name__} is no interaction: give one, such as dataset.with_id(12)")
+        raise SimulationError(
+            f"{type(interaction).__name__} is no interaction: give one, such as dataset.with_id(12)"
+        )
     made = interaction.provenance
     if made.source != "simulated":
         raise SimulationError(
