@@ -1,4 +1,4 @@
-"""Draws docs/images/one-shot.png: what the predictor of whole motions makes of a view."""
+"""Draws docs/images/one-shot.png: from a view to the futures of the direct trajectory predictor."""
 
 from pathlib import Path
 
@@ -79,7 +79,7 @@ def _pivot_edges(ax, hull: np.ndarray, com: np.ndarray, edges) -> None:
     end = com[:2] + 0.75 * ray
     ax.plot([-lift[1], -end[1]], [lift[0], end[0]], color=INK, lw=1, ls=(0, (4, 2)))
     ax.plot(-com[1], com[0], "o", color=INK, ms=6)
-    ax.text(-com[1] + 0.006, com[0] - 0.002, "centre of mass", fontsize=10)
+    ax.text(-com[1] + 0.006, com[0] - 0.002, "centre\nof mass", fontsize=10, va="center")
     for k, (color, name) in enumerate(((FIRST, "first pivot edge"), (SECOND, "second pivot edge"))):
         a, b = edges.ends[0, k].numpy()
         ax.plot([-a[1], -b[1]], [a[0], b[0]], color=color, lw=4, solid_capstyle="round")
@@ -108,7 +108,7 @@ def _futures(ax) -> None:
         ax.add_patch(
             FancyArrowPatch((1.6, y + 0.4), (1.95, y + 0.4), color=color, arrowstyle="-|>", mutation_scale=13)
         )
-    ax.text(0, 0.1, "one such row for each hinge and each outcome: a future", fontsize=10, color=INK)
+    ax.text(0, 0.1, "one such row for each pivot edge and each outcome: a future", fontsize=10, color=INK)
     ax.set(
         xlim=(-0.1, 4.6), ylim=(-0.1, 3.1), title="3  Futures that exclude each other", xticks=[], yticks=[]
     )
