@@ -17,7 +17,7 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.doctor import examine
 from foretrace.objects import Cylinder, ObjectModel, Prism
 from foretrace.simulation.collect import CollectConfig
-from foretrace.simulation.engine import ENGINES, Engine, engine_class, make_engine
+from foretrace.simulation.engine import ENGINES, Engine, make_engine
 from foretrace.simulation.lever_up import simulate
 
 SQUARE = Prism([(0.0, 0.0), (0.16, 0.0), (0.16, 0.12), (0.0, 0.12)])
@@ -198,7 +198,7 @@ def test_impossible_motions_of_the_tool_are_refused(engine, motion, message):
 @every_engine
 def test_engines_are_registered_and_refuse_what_they_cannot_play(engine):
     assert engine in ENGINES
-    kind = engine_class(engine)
+    kind = ENGINES.find(engine)
     assert issubclass(kind, Engine)
     assert kind.name == engine
     for wrong in (("hand", 0.002, 0.05), ("tool", 0.003, 0.05), ("tool", -1.0, 0.05)):

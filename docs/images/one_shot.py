@@ -1,4 +1,4 @@
-"""Draws docs/images/one-shot.png: from a view to the futures of the direct trajectory predictor."""
+"""Draws docs/images/one-shot.png: how the direct trajectory predictor processes a view."""
 
 from pathlib import Path
 
@@ -97,8 +97,8 @@ def _pivot_edges(ax, hull: np.ndarray, com: np.ndarray, edges) -> None:
 
 def _futures(ax) -> None:
     boxes = (
-        (FIRST, 2.05, ("probability", "weights of 32 PCA components", "expected error")),
-        (SECOND, 0.55, ("probability", "weights of 32 PCA components", "expected error")),
+        (FIRST, 2.05, ("probability", "weights of 32 PCA components", "predicted error scale")),
+        (SECOND, 0.55, ("probability", "weights of 32 PCA components", "predicted error scale")),
     )
     for color, y, words in boxes:
         ax.add_patch(Rectangle((0, y), 1.55, 0.8, facecolor="white", edgecolor=color, lw=1.8))
@@ -108,7 +108,7 @@ def _futures(ax) -> None:
         ax.add_patch(
             FancyArrowPatch((1.6, y + 0.4), (1.95, y + 0.4), color=color, arrowstyle="-|>", mutation_scale=13)
         )
-    ax.text(0, 0.1, "one such row for each pivot edge and each outcome: a future", fontsize=10, color=INK)
+    ax.text(0, 0.1, "one row for each pivot edge and outcome: a future", fontsize=10, color=INK)
     ax.set(
         xlim=(-0.1, 4.6), ylim=(-0.1, 3.1), title="3  Futures that exclude each other", xticks=[], yticks=[]
     )

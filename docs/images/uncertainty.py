@@ -1,4 +1,4 @@
-"""Draws docs/images/uncertainty.svg: a sketch of futures, tubes and observed samples. Nothing in it was measured."""
+"""Draws docs/images/uncertainty.svg: a sketch of futures, regions and observed samples; nothing in it was measured."""
 
 from pathlib import Path
 
@@ -39,14 +39,14 @@ def main() -> None:
         )  # fmt: skip
         after.set_title(f"Under way, after {SEEN} samples: one is left")
         before.annotate(
-            "tube: whole motions stay in one of\nthe tubes with the level's probability",
+            "prediction region: the whole motion stays\nin one of the tubes with the level's probability",
             lifted[33] + [-0.35, 0.35], (-7.9, 6.45), color=INK, fontsize=9, va="center",
             arrowprops={"arrowstyle": "-", "color": GREY},
         )  # fmt: skip
         for ax in (before, after):
             ax.plot(*lifted[0], "s", color=INK, markersize=6, zorder=5)
             ax.plot(0, 0, "^", color=INK, markersize=8, clip_on=False)
-            ax.text(-0.15, 0.3, "hinge", ha="right", fontsize=9)
+            ax.text(-0.15, 0.3, "pivot edge", ha="right", fontsize=9)
             ax.axhline(0, color=GREY, linewidth=1)
             ax.set(xlim=(-8.1, 0.4), ylim=(-0.1, 7.1), aspect="equal", xlabel="along the action [cm]")
         before.text(*(lifted[0] + [-0.9, -0.75]), "centre of mass at rest", fontsize=9, va="center")

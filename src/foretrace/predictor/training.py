@@ -39,8 +39,10 @@ Source = InteractionBatch | Dataset
 PIECE = 2048
 """Rows that are normalised or imagined together."""
 MEASURE = "measure "
-LARGE = 20_000
+IN_MEMORY = 4_000
 """A data set of more interactions is prepared piece by piece: it need not fit into memory."""
+LARGE = 20_000
+"""States of a part of more interactions are kept in single precision, and features take the place of their inputs."""
 
 
 @dataclass
@@ -67,8 +69,8 @@ class _Part:
 
     @property
     def large(self) -> bool:
-        """Whether it was prepared piece by piece."""
-        return isinstance(self.source, Dataset)
+        """Whether there is room for one copy of it only."""
+        return self.states.dtype == np.float32
 
     @property
     def valid(self) -> np.ndarray:
@@ -152,7 +154,7 @@ def train_predictor(
     if not isinstance(data, Dataset | InteractionBatch):
         raise TrainingError(f"data of type {type(data).__name__}: give a Dataset or an InteractionBatch")
     training = _loop_settings(predictor, training)
-    source = data.batch() if isinstance(data, Dataset) and len(data) <= LARGE else data
+    source = data.batch() if isinstance(data, Dataset) and len(data) <= IN_MEMORY else data
     folder = RunFolder(out)
     threads = training.threads or (folder.threads if resume else None)
     with _made(predictor, training, source, threads) as made:
@@ -418,7 +420,7 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> _Part:
         columns = {
             "inputs": piece.inputs.numpy(),
             "context": piece.context,
-            "states": piece.states.astype(np.float32),
+            "states": piece.states.astype(np.float32 if len(source) > LARGE else np.float64),
             "lengths": piece.lengths,
             "outcomes": piece.outcomes,
             **{MEASURE + name: values for name, values in piece.measures.items()},

@@ -26,7 +26,7 @@ from foretrace.interactions.dataset import count_outcomes
 from foretrace.interactions.record import Interaction
 from foretrace.objects import ObjectModel
 from foretrace.simulation import lever_up, recipes
-from foretrace.simulation.engine import engine_class
+from foretrace.simulation.engine import ENGINES
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import NOTHING, Randomisation
 from foretrace.simulation.recipes import RECIPES
@@ -187,7 +187,7 @@ def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[s
 
 
 def _current_versions(config: CollectConfig) -> dict[str, str]:
-    library = engine_class(config.simulation.engine).library
+    library = ENGINES.find(config.simulation.engine).library
     libraries = versions_of("foretrace", library, "numpy", "pyarrow")
     return {"python": platform.python_version(), "machine": platform.machine(), **libraries}
 

@@ -28,6 +28,11 @@ ToolMotion = Callable[[Float[np.ndarray, " time"]], Float[np.ndarray, "time 6"]]
 FreePlay = tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]
 """Poses of the object frame, and velocities of the centre of mass and about it, table frame."""
 
+ENGINES: Registry[type["Engine"]] = Registry("engine", "foretrace.engines", SimulationError)
+"""Every engine by its name; the built-in ones are imported on first use."""
+ENGINES.declare("mujoco", "foretrace.simulation.mujoco_engine")
+ENGINES.declare("bullet", "foretrace.simulation.bullet_engine")
+
 
 class Engine(ABC):
     """Plays what a tool does to an object; it knows no action.
@@ -46,8 +51,7 @@ class Engine(ABC):
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        if cls.name not in BUILT_IN:
-            ENGINES.add(cls.name, cls)
+        ENGINES.add(cls.name, cls)
 
     @abstractmethod
     def play(
@@ -87,36 +91,6 @@ class Engine(ABC):
         """Plays the motion of a free body, as `simulate_free_motion` describes it."""
 
 
-def _mujoco() -> type[Engine]:
-    from foretrace.simulation.mujoco_engine import MujocoEngine
-
-    return MujocoEngine
-
-
-def _bullet() -> type[Engine]:
-    from foretrace.simulation.bullet_engine import BulletEngine
-
-    return BulletEngine
-
-
-BUILT_IN: dict[str, Callable[[], type[Engine]]] = {"mujoco": _mujoco, "bullet": _bullet}
-"""Engines that are imported on first use."""
-ENGINES: Registry[Callable[..., Any]] = Registry("engine", "foretrace.engines", SimulationError)
-"""Every engine by its name: a class, or for a built-in one a function that imports it."""
-for _name, _load in BUILT_IN.items():
-    ENGINES.add(_name, _load)
-
-
-def engine_class(name: str) -> type[Engine]:
-    """The engine of a name.
-
-    Raises:
-        SimulationError: There is no such engine.
-    """
-    found = ENGINES.find(name)
-    return found if isinstance(found, type) else found()
-
-
 @lru_cache(maxsize=4)
 def make_engine(name: str, embodiment: str, timestep: float, sample_period: float) -> Engine:
     """An engine, ready to play.
@@ -130,7 +104,7 @@ def make_engine(name: str, embodiment: str, timestep: float, sample_period: floa
     Raises:
         SimulationError: If there is no such engine, or it cannot play that.
     """
-    return engine_class(name)(embodiment, timestep, sample_period)
+    return ENGINES.find(name)(embodiment, timestep, sample_period)
 
 
 def sample_tool(tool_motion: ToolMotion, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 6"]:

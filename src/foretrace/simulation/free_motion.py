@@ -12,7 +12,7 @@ from foretrace.errors import SimulationError
 from foretrace.geometry import Numbers, continuous_quaternions
 from foretrace.interactions.motions import ContactParameters
 from foretrace.objects.body import Body
-from foretrace.simulation.engine import engine_class
+from foretrace.simulation.engine import ENGINES
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def simulate_free_motion(
             f"timestep = {timestep} s, duration = {duration} s: choose at most 0.02 s and an hour"
         )
     steps = int(np.ceil(duration / timestep - 1e-9))
-    poses, velocities = engine_class(engine).play_freely(
+    poses, velocities = ENGINES.find(engine).play_freely(
         body, pose, speed, contact_parameters, steps, timestep
     )
     if not np.isfinite(poses).all():
