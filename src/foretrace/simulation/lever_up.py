@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import FAILED, Action, Motion, ToolPath
+from foretrace.actions import FAILED, Action, Judgement, Motion, ToolPath
 from foretrace.errors import ActionError, SimulationError
 from foretrace.files import versions_of
 from foretrace.geometry import (
@@ -217,6 +217,10 @@ def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
     com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
     judgement = action.judge(motion, obj, com)
+    if not isinstance(judgement, Judgement):
+        raise SimulationError(
+            f"action {action.label!r} was judged {judgement!r}: its judge is to return a Judgement"
+        )
     if judgement.outcome not in action.outcomes:
         raise SimulationError(
             f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
