@@ -99,6 +99,8 @@ def test_dataset_reads_what_was_written_and_hides_failures(folder, interactions)
     assert_equal(dataset.with_id(14), interactions[14])
     assert dataset.outcomes() == {"levered": 17, "slipped": 2}
     assert repr(dataset) == f"Dataset({str(folder)!r}: 19 interactions: 17 levered, 2 slipped)"
+    assert repr(dataset[3]).startswith("Interaction(3: lever-up of a prism, levered, ")
+    assert max(len(repr(part)) for part in (dataset[3], dataset[3].view, dataset[3].effect)) < 100
     assert repr(dataset[:0]) == f"Dataset({str(folder)!r}: 0 interactions)"
 
 
@@ -125,8 +127,13 @@ def test_dataset_slices_and_filters(folder):
         dataset.where(outcome=("levered", "sliped"))
     with pytest.raises(DatasetError, match="no interaction 13"):
         dataset.with_id(13)
-    with pytest.raises(IndexError):
-        dataset[19]
+    for rows, message in {
+        19: "row 19 of .* choose one of the 19",
+        "a": "rows 'a' of .* give a number",
+    }.items():
+        with pytest.raises(DatasetError, match=message) as caught:
+            dataset[rows]
+        assert isinstance(caught.value, IndexError)
 
 
 def test_batch_equals_the_interactions_one_by_one(folder):

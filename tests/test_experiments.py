@@ -247,6 +247,14 @@ def test_failed_trials_are_listed_and_do_not_lose_the_others(workers: int, tmp_p
     assert [each["message"] for each in json.loads((tmp_path / SUMMARY).read_text())["failed"]]
 
 
+def test_a_row_that_changes_a_field_of_its_trial_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Toy, "run", lambda self, trial, folder: [{"seed": 7, "value": 1.0}])
+    found = run_experiment(Toy((0,)), tmp_path, console=QUIET)
+    assert [message for _, message in found.failures] == [
+        "a row has seed = 7, its trial has 0: call the column otherwise"
+    ]
+
+
 def test_a_crash_between_trials_loses_nothing(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         run_experiment(Toy(stop_at=2), tmp_path, console=QUIET)

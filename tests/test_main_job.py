@@ -143,6 +143,8 @@ def test_wrong_input_is_one_clear_line(
 ) -> None:
     bad = tmp_path / "bad.txt"
     bad.write_text("1 2 3\n4 5 6\n")
+    empty = tmp_path / "empty.txt"
+    empty.write_text("# no corners yet\n")
     crossed = tmp_path / "crossed.txt"
     crossed.write_text("0 0\n0.1 0.1\n0.1 0\n0 0.1\n")
     shape = ["--polygon", str(polygon)]
@@ -153,6 +155,7 @@ def test_wrong_input_is_one_clear_line(
         "--photo shows the object": ["predict", str(run), *shape, "--photo", str(polygon)],
         "choose 0 to 3": ["predict", str(run), *shape, "--edge", "4"],
         "between 0 and 1": ["predict", str(run), *shape, "--edge", "0", "--fraction", "1.5"],
+        "holds no corners": ["predict", str(run), "--polygon", str(empty), "--edge", "0"],
         "3 numbers per line": ["predict", str(run), "--polygon", str(bad), "--edge", "0"],
         "Self-intersection": ["predict", str(run), "--polygon", str(crossed), "--edge", "0"],
         "cannot read corners": ["predict", str(run), "--polygon", str(tmp_path / "none.txt"), "--edge", "0"],

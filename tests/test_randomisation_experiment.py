@@ -192,9 +192,9 @@ def test_actions_that_vary_are_context_without_a_stand_in(folders, tmp_path, mon
     spreads = [np.ptp(batch.parameters["sweep"]) > 0.1 for _, batch in told]
     assert spreads == [False, False, True, False]  # plain, with nominal values, varied, with nominal values
     assert set(told[3][1].parameters["sweep"]) == {ToolPath.sweep}
-    assert list(found.summary["none"]) == ["plain test", "randomised test"]
+    assert list(found.summary["none"]) == ["plain test", "varied test"]
     axis = varied.figures(table)["randomisation"].axes[0]
-    assert [label.get_text() for label in axis.get_xticklabels()] == ["plain test", "randomised test"]
+    assert [label.get_text() for label in axis.get_xticklabels()] == ["plain test", "varied test"]
     with pytest.raises(
         ResultsError, match=r"insertion is the same all over .*: simulate it with --vary-action"
     ):
@@ -208,12 +208,12 @@ def test_the_report_has_means_and_differences_within_seeds(experiment, table):
     assert set(NOMINAL) == set(TESTS.values())
     summary = experiment.summarise(table)
     assert list(summary) == ["none", "sp-rule"]
-    found = summary["sp-rule"]["randomised test"]
+    found = summary["sp-rule"]["varied test"]
     assert list(found["errors"]) == list(BARS)
     chosen = table.loc[table["features"].eq("sp-rule") & table["metric"].eq("randomised_full")]
     means = chosen.groupby("setting")["value"].mean()
     assert found["errors"]["plain data"]["mean"] == pytest.approx(means[PLAIN], abs=1e-4)
-    gain = found["differences"]["randomised instead of plain"]
+    gain = found["differences"]["varied instead of plain"]
     assert gain["mean"] == pytest.approx(means[VARIED] - means[PLAIN], abs=2e-4)
     assert gain["low"] <= gain["mean"] <= gain["high"]
     text = experiment.report(summary, table)
@@ -235,7 +235,7 @@ def test_the_figure_shows_every_bar_with_its_height(experiment, table):
 def test_an_unfinished_comparison_is_reported_as_far_as_it_is(experiment, table):
     some = table.loc[table["setting"].ne(KNOWING) & table["seed"].eq(0)]
     summary = experiment.summarise(some)
-    assert list(summary["none"]["plain test"]["errors"]) == ["plain data", "randomised data"]
+    assert list(summary["none"]["plain test"]["errors"]) == ["plain data", "varied data"]
     assert summary["none"]["plain test"]["errors"]["plain data"]["low"] is None
     assert "| `none` | plain test |" in experiment.report(summary, some)
     assert len(experiment.figures(some)["randomisation"].axes) == 2

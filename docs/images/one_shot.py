@@ -79,7 +79,7 @@ def _pivot_edges(ax, hull: np.ndarray, com: np.ndarray, edges) -> None:
     end = com[:2] + 0.75 * ray
     ax.plot([-lift[1], -end[1]], [lift[0], end[0]], color=INK, lw=1, ls=(0, (4, 2)))
     ax.plot(-com[1], com[0], "o", color=INK, ms=6)
-    ax.text(-com[1] + 0.006, com[0] - 0.002, "centre of mass", fontsize=10)
+    ax.text(-com[1] + 0.006, com[0] - 0.002, "centre\nof mass", fontsize=10, va="center")
     for k, (color, name) in enumerate(((FIRST, "first pivot edge"), (SECOND, "second pivot edge"))):
         a, b = edges.ends[0, k].numpy()
         ax.plot([-a[1], -b[1]], [a[0], b[0]], color=color, lw=4, solid_capstyle="round")

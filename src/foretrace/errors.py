@@ -35,6 +35,10 @@ class DatasetError(ForetraceError):
     """A data set that is missing, damaged, of another version or made with another configuration."""
 
 
+class RowError(DatasetError, IndexError):
+    """A row that a data set does not have; an IndexError too, as of any sequence."""
+
+
 class TrainingError(ForetraceError):
     """A training that cannot start: unknown features, a split larger than the data, a folder in use."""
 

@@ -8,7 +8,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -22,7 +22,7 @@ from rich.console import Console
 
 import foretrace
 from foretrace.errors import ForetraceError, ResultsError
-from foretrace.evaluation.experiment import Experiment, Trial
+from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.storage import Rows, Store, kept_identity, table_of
 from foretrace.files import as_json, versions_of
 from foretrace.predictor.run_folder import git_commit
@@ -190,6 +190,7 @@ class _Work:
                 if os.getpid() != self.parent:
                     warnings.simplefilter("ignore")  # the parent has warned about the data
                 rows = list(experiment.run(trial, self.store.folder))
+            _check_columns(trial, rows)
             seconds = time.perf_counter() - started
             self.store.save(trial, rows, seconds)
         except ForetraceError as error:
@@ -197,6 +198,16 @@ class _Work:
         first = rows[0] if rows else {}
         number = f"{first['metric']} {first['value']:.3f} " if "metric" in first and "value" in first else ""
         return trial, None, f"{number}in {seconds:.0f} s"
+
+
+def _check_columns(trial: Trial, rows: Iterable[Row]) -> None:
+    """A row may repeat a field of its trial, but not change it."""
+    for row in rows:
+        for name, value in trial.settings.items():
+            if row.get(name, value) != value:
+                raise ResultsError(
+                    f"a row has {name} = {row[name]!r}, its trial has {value!r}: call the column otherwise"
+                )
 
 
 _HERE: dict[bytes, Experiment] = {}

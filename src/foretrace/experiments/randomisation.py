@@ -145,14 +145,14 @@ class RandomisationExperiment(Experiment):
     varied: Path | None = None
     """Folder of a data set that was simulated with --randomise or --vary-action."""
     features: tuple[str, ...] = ()
-    """What the predictors are told about an object; by default sp-rule, sc-800 and im-cnn for lstm, and its own
+    """Features of the predictors; by default sp-rule, sc-800 and im-cnn for lstm, and its own
     features for another predictor."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of splits and trainings."""
     repeats: int = 3
     """Lever-ups by the stand-in at every contact; 0 leaves it out. It levers with the nominal action."""
     context: tuple[str, ...] = NAMES
-    """What varies, and is told to some of the predictors: as in `foretrace train`."""
+    """What varies, and is the context of some of the predictors: as in `foretrace train`."""
     predictor: str = BASE
     """Kind of predictor: lstm or one-shot."""
     epochs: int | None = None
@@ -245,7 +245,7 @@ class RandomisationExperiment(Experiment):
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """Errors and differences as two tables."""
-        parts = ["# Plain and randomised training data"]
+        parts = ["# Plain and varied training data"]
         for part, columns, sign, words in (
             ("errors", BARS, "", "Errors in cm, means over the seeds [95 % interval]."),
             (
@@ -315,7 +315,7 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     Args:
         predictor: The predictor; it starts where the marker is seen before the action.
         shown: The stand-in's lever-ups.
-        nominal: Whether a predictor that is conditioned on constants is told the nominal ones, not the stand-in's.
+        nominal: Whether the context is the nominal values instead of the stand-in's.
     """
     views = [hull_of(each.observed.view) if each.subject.hull else each.observed.view for each in shown]
     times = predictor.times.cpu().numpy()

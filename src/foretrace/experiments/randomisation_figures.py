@@ -1,4 +1,4 @@
-"""The compared predictors and tests of randomised training data, and their picture."""
+"""The compared predictors and tests of varied training data, and their picture."""
 
 import numpy as np
 import pandas as pd
@@ -12,10 +12,10 @@ from foretrace.pictures.style import GREY, INK, new_figure, styled
 
 PLAIN, VARIED, KNOWING = "plain", "randomised", "knowing"
 SETTINGS = (PLAIN, VARIED, KNOWING)
-"""What is learned from: plain data; randomised data; the same, conditioned on what varies."""
+"""Training data: plain; varied; the same, conditioned on what varies."""
 TESTS = {
     "plain test": "plain_full",
-    "randomised test": "randomised_full",
+    "varied test": "randomised_full",
     "stand-in, printed": "stand_in_printed",
     "stand-in, everyday": "stand_in_everyday",
 }
@@ -26,20 +26,20 @@ NOMINAL = {
     "stand_in_printed": "stand_in_printed_nominal",
     "stand_in_everyday": "stand_in_everyday_nominal",
 }
-"""The same where a predictor that knows what varies is told the nominal values."""
+"""The same with the nominal values as context."""
 BARS = {
     "plain data": (PLAIN, False, GREY, ""),
-    "randomised data": (VARIED, False, ORANGE, ""),
-    "randomised, true values known": (KNOWING, False, BLUE, ""),
-    "randomised, told the nominal values": (KNOWING, True, GREEN, "///"),
+    "varied data": (VARIED, False, ORANGE, ""),
+    "varied, true values as context": (KNOWING, False, BLUE, ""),
+    "varied, nominal values as context": (KNOWING, True, GREEN, "///"),
 }
-"""Predictors: what they learned from, whether they are told the nominal values, and how they are drawn."""
+"""Predictors: what they learned from, whether their context is the nominal values, and how they are drawn."""
 CONTRASTS = {
-    "randomised instead of plain": ("randomised data", "plain data"),
-    "true values known": ("randomised, true values known", "randomised data"),
+    "varied instead of plain": ("varied data", "plain data"),
+    "true values as context": ("varied, true values as context", "varied data"),
     "nominal values instead of true ones": (
-        "randomised, told the nominal values",
-        "randomised, true values known",
+        "varied, nominal values as context",
+        "varied, true values as context",
     ),
 }
 """Differences of two predictors of the same seed: the first less the second."""
@@ -73,7 +73,7 @@ def randomisation_figure(table: pd.DataFrame) -> Figure:
     ]
     fig.legend(handles=patches, loc="outside lower center", ncols=2, columnspacing=1.4)
     note = f"bars: means over {seeds_in_words(table)} with 95 % intervals; dots: seeds"
-    finish(fig, "What randomised training data do, and what it helps to know what varies", note)
+    finish(fig, "Training on plain and on varied data, with and without context", note)
     return fig
 
 

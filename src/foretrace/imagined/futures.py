@@ -200,6 +200,13 @@ class ImaginedEffect:
     warnings: tuple[str, ...] = ()
     """Respects in which object or action are unlike those that the predictor has learned from."""
 
+    def __repr__(self) -> str:
+        chances = ", ".join(
+            f"{name} {float(chance[0]):.3g}" for name, chance in self.futures.outcomes().items()
+        )
+        warned = f", {len(self.warnings)} warnings" if self.warnings else ""
+        return f"ImaginedEffect({len(self.times)} samples, {chances}{warned})"
+
 
 @dataclass(frozen=True)
 class ImaginedBatch:

@@ -208,6 +208,8 @@ class Imaginer(ABC):
         self._check_sight()
         _check_type("view", view, TopDownView)
         check_object(view.mask, view.height)
+        if not isinstance(actions, Iterable):
+            raise PredictionError(f"actions of type {type(actions).__name__}: give a list of actions")
         actions = tuple(actions)
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")
@@ -272,7 +274,7 @@ def _naming(name: str) -> Iterator[None]:
 
 def _check_type(name: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
-        raise PredictionError(f"{name} is a {type(value).__name__}: give a {kind.__name__}")
+        raise PredictionError(f"{name} of type {type(value).__name__}: give {kind.__name__}")
 
 
 def _point(com: Numbers) -> Float[np.ndarray, "3"]:

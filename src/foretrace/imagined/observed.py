@@ -135,6 +135,6 @@ def observed_motion(observed: Any) -> ObservedMotion:
     if isinstance(observed, Effect):
         return ObservedMotion.of(observed)
     raise PredictionError(
-        f"observed is a {type(observed).__name__}: give an Effect, or ObservedMotion(times, poses) with the object's "
-        "poses in the action frame"
+        f"observed of type {type(observed).__name__}: give an Effect, or ObservedMotion(times, poses) with "
+        "poses of the object in the action frame"
     )

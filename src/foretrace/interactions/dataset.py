@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from foretrace.actions import ACTIONS, FAILED
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, RowError
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
 from foretrace.interactions.batch import batch_of, common_times
@@ -95,10 +95,15 @@ class Dataset:
     def __getitem__(self, rows: Any) -> Any:
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):
-                raise IndexError(f"interaction {rows} of {len(self)}")
+                raise RowError(f"row {rows} of {self.path}: choose one of the {len(self)} rows from 0 on")
             number, row = self._places[rows]
             return self._decode(self._shards.table(int(number)).slice(row, 1).to_pylist()[0])
-        return self._view(np.arange(len(self))[rows])
+        try:
+            return self._view(np.arange(len(self))[rows])
+        except IndexError as error:
+            raise RowError(
+                f"rows {rows!r} of {self.path}: give a number, a slice or an array of numbers"
+            ) from error
 
     def __iter__(self) -> Iterator[Interaction]:
         for table in self._pieces():

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import Action, Motion
+from foretrace.actions import Action, Judgement, Motion
 from foretrace.actions import Outcome as Outcome
 from foretrace.errors import ActionError
 from foretrace.interactions.topdown import TopDownView
@@ -63,9 +63,13 @@ class Effect:
             fall_index: First sample at which the object falls off the table.
 
         Raises:
-            ActionError: The judge names an outcome that the action does not have.
+            ActionError: The judge returns no Judgement, or names an outcome that the action does not have.
         """
         judgement = action.judge(motion, obj, com)
+        if not isinstance(judgement, Judgement):
+            raise ActionError(
+                f"action {action.label!r} was judged {judgement!r}: its judge is to return a Judgement"
+            )
         if judgement.outcome not in action.outcomes:
             raise ActionError(
                 f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
@@ -85,6 +89,9 @@ class Effect:
             fall_index=fall_index,
             path_error=motion.path_error,
         )
+
+    def __repr__(self) -> str:
+        return f"Effect({self.outcome}, {len(self.times)} samples)"
 
 
 @dataclass(frozen=True)
@@ -166,3 +173,10 @@ class Interaction:
     """Offset of the executed action from the commanded one."""
     id: int = 0
     """Number within its data set."""
+
+    def __repr__(self) -> str:
+        made = self.provenance
+        return (
+            f"Interaction({self.id}: {self.action.label} of a {self.object.kind}, {self.effect.outcome}, "
+            f"{len(self.effect.times)} samples, {made.source})"
+        )

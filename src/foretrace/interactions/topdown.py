@@ -62,6 +62,10 @@ class TopDownView:
         for values in (self.mask, self.height):
             values.setflags(write=False)
 
+    def __repr__(self) -> str:
+        area = 1e4 * self.mask.sum() * self.metres_per_pixel**2
+        return f"TopDownView(object of {area:.0f} cm2, up to {100 * self.height.max():.1f} cm high)"
+
     @classmethod
     def of(cls, obj: ObjectModel, action: Action) -> "TopDownView":
         """The exact view of a known object: a pixel shows what lies at its centre.

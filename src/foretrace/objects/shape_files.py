@@ -37,11 +37,14 @@ def read_polygon(file: Path) -> Float[np.ndarray, "n 2"]:
     """
     try:
         text = file.read_text(encoding="utf-8")
-        corners = np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2)
+        lines = [line.split("#")[0].replace(",", " ").strip() for line in text.splitlines()]
+        corners = np.loadtxt([line for line in lines if line] or ["nan"], ndmin=2)
     except (OSError, ValueError) as error:
         raise ShapeError(
             f'cannot read corners from {file} ({error}): write one "x y" per line [m]'
         ) from error
+    if not any(lines):
+        raise ShapeError(f'{file} holds no corners: write one "x y" per line [m]')
     if corners.ndim != 2 or corners.shape[1] != 2:
         raise ShapeError(f'{file} has {corners.shape[-1]} numbers per line: write one "x y" per line [m]')
     return corners

@@ -315,6 +315,11 @@ class EffectPredictor(Imaginer, nn.Module):
         with _evaluating(self):
             parts = inputs.split(ROWS_AT_ONCE)
             first = self.features(parts[0].to(self.device))
+            if first.shape != (len(parts[0]), self.features.num_features):
+                raise TrainingError(
+                    f"features {self.features.label!r} have the shape {tuple(first.shape)} for {len(parts[0])} "
+                    f"interactions: num_features is {self.features.num_features}"
+                )
             if in_place and (first.shape, first.dtype) == (parts[0].shape, inputs.dtype):
                 for part in parts:
                     part.copy_(self.features(part.to(self.device)))

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from foretrace.errors import TrainingError
 from foretrace.predictor.base import EffectPredictor
 
 FULL_RATE_INPUTS = 256
@@ -16,7 +17,12 @@ FEATURE_DECAY = 1 / 800
 def make_optimizer(predictor: EffectPredictor) -> torch.optim.Optimizer:
     """AdamW over what is trainable; a group's learning rate is to be its ``share`` of that of the step."""
     # The loss of a state's small change is small: the usual epsilon of 1e-8 would outweigh its gradient.
-    return torch.optim.AdamW(parameter_groups(predictor), eps=1e-12, fused=True)
+    groups = parameter_groups(predictor)
+    if not groups:
+        raise TrainingError(
+            f"predictor {predictor.label!r} has no parameters to train: create them in __init__"
+        )
+    return torch.optim.AdamW(groups, eps=1e-12, fused=True)
 
 
 def parameter_groups(predictor: EffectPredictor) -> list[dict[str, Any]]:

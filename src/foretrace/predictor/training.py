@@ -112,6 +112,8 @@ def train_predictor(
         TrainingError: The predictor does not fit the data or was trained before, the split is larger than the data, the
             folder is in use, or the loss is no longer finite.
     """
+    if not isinstance(data, Dataset | InteractionBatch):
+        raise TrainingError(f"data of type {type(data).__name__}: give a Dataset or an InteractionBatch")
     training = _loop_settings(predictor, training)
     source = data.batch() if isinstance(data, Dataset) and len(data) <= IN_MEMORY else data
     folder = RunFolder(out)
@@ -323,7 +325,7 @@ def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: Train
     ):
         if not isinstance(value, kinds):
             wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
-            raise TrainingError(f"{name} is a {type(value).__name__}: give a {wanted}")
+            raise TrainingError(f"{name} of type {type(value).__name__}: give {wanted}")
     config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
     return config.training if training is None else training
 

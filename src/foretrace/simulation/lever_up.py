@@ -96,7 +96,7 @@ def simulate_lever_up(
         ViewError: If the object does not fit in the view.
     """
     if not isinstance(action, Action):
-        raise ActionError(f"{action!r} is no action: give a LeverUp or another Action")
+        raise ActionError(f"{type(action).__name__} is no action: give a LeverUp or another Action")
     action.check_contact(obj)
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
@@ -171,6 +171,10 @@ def replay(interaction: Interaction) -> Interaction:
     Raises:
         SimulationError: The interaction is a recording of a real one, or its engine is not installed.
     """
+    if not isinstance(interaction, Interaction):
+        raise SimulationError(
+            f"{type(interaction).__name__} is no interaction: give one, such as dataset.with_id(12)"
+        )
     made = interaction.provenance
     if made.source != "simulated":
         raise SimulationError(
