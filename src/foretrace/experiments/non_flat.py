@@ -158,17 +158,16 @@ class NonFlat(Experiment):
                 "groups": {name: found for name, found in groups.items() if found},
                 "outcomes": {str(name): _compare(part) for name, part in mine.groupby("outcome")},
             }
-        by_kind = {name: _members(probes, name) for name in ("alike", *KINDS)}
-        sensitivity = {
-            name: {
-                "probes": len(part),
-                "irreducible_cm": round(float(np.mean(part["irreducible_cm"].to_numpy(float))), 4),
-                "median_irreducible_cm": round(float(np.median(part["irreducible_cm"].to_numpy(float))), 4),
-                "same_outcome": round(float(np.mean(part["same"].to_numpy(float))), 4),
-            }
-            for name, part in by_kind.items()
-            if len(part)
-        }
+        sensitivity = {}
+        for name in ("alike", *KINDS):
+            if len(part := _members(probes, name)):
+                apart = part["irreducible_cm"].astype(float)
+                sensitivity[name] = {
+                    "probes": len(part),
+                    "irreducible_cm": round(float(apart.to_numpy().mean()), 4),
+                    "median_irreducible_cm": round(float(apart.median()), 4),
+                    "same_outcome": round(float(part["same"].astype(float).mean()), 4),
+                }
         return {"paper": PAPER, "goal": GOAL, "settings": settings, "outcome_sensitivity": sensitivity}
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
@@ -321,26 +320,22 @@ def _compare(rows: pd.DataFrame) -> dict[str, Any]:
     """Both channels on the same interactions; empty if there are none."""
     if rows.empty:
         return {}
-    full = {channel: _by_seed(rows, channel, "full_cm") for channel in CHANNELS}
+    columns = ["full_cm", "final_cm", "still_cm"]
+    means = rows.groupby(["channel", "seed"])[columns].agg(lambda values: values.to_numpy(float).mean())
+    mask, height = (means.loc[channel] for channel in CHANNELS)
     found: dict[str, Any] = {
         channel: {
-            "full_cm": interval(full[channel]).as_dict(4),
-            "final_cm": interval(_by_seed(rows, channel, "final_cm")).as_dict(4),
-            "median_cm": round(float(np.median(rows.loc[rows["channel"].eq(channel), "full_cm"])), 4),
+            "full_cm": interval(part["full_cm"]).as_dict(4),
+            "final_cm": interval(part["final_cm"]).as_dict(4),
+            "median_cm": round(float(rows.loc[rows["channel"].eq(channel), "full_cm"].median()), 4),
         }
-        for channel in CHANNELS
+        for channel, part in zip(CHANNELS, (mask, height), strict=True)
     }
-    found["interactions"] = round(len(rows) / len(CHANNELS) / len(full["mask"]))
-    found["still_cm"] = round(float(_by_seed(rows, "mask", "still_cm").mean()), 4)
-    found["ratio"] = interval(full["height"] / full["mask"]).as_dict(4)
-    return found
-
-
-def _by_seed(rows: pd.DataFrame, channel: str, column: str) -> np.ndarray:
-    """The mean of a column for each seed."""
-    mine = rows.loc[rows["channel"].eq(channel)]
-    seeds = sorted(set(mine["seed"]))
-    return np.array([mine.loc[mine["seed"].eq(seed), column].to_numpy(float).mean() for seed in seeds])
+    return found | {
+        "interactions": round(len(rows) / len(CHANNELS) / len(mask)),
+        "still_cm": round(float(mask["still_cm"].to_numpy().mean()), 4),
+        "ratio": interval(height["full_cm"] / mask["full_cm"]).as_dict(4),
+    }
 
 
 def _line(name: str, group: Mapping[str, Any]) -> list[str]:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -130,7 +131,7 @@ class Paper(Experiment):
             place = summary
             for name in ("experiment", "features", "setting"):
                 place = place.setdefault(line[name], {})
-            numbers = {name: _rounded(line[name]) for name in ("mean", "low", "high", "std")}
+            numbers = {name: float(f"{line[name]:.6g}") for name in ("mean", "low", "high", "std")}
             place[line["metric"]] = numbers | {"seeds": line["seeds"]}
         return summary
 
@@ -143,14 +144,12 @@ class Paper(Experiment):
         """The claims, and a table for each comparison."""
         parts = ["# The paper's comparisons", "## The paper's claims", *claims_markdown(self.judge(rows))]
         for experiment, by_features in summary.items():
-            metric = next(
-                (m for m in MEASURED for s in by_features.values() for c in s.values() if m in c), None
-            )
+            measured = {m for settings in by_features.values() for cells in settings.values() for m in cells}
+            metric = next((name for name in MEASURED if name in measured), None)
             if metric is None:
                 continue
             unit = "share with both support points right" if metric == "accuracy" else "mean error in cm"
-            present = {setting for settings in by_features.values() for setting in settings}
-            settings = sorted(present, key=lambda setting: (len(setting), setting))
+            settings = sorted(set(chain(*by_features.values())), key=lambda setting: (len(setting), setting))
             lines = [
                 [f"`{label}`", *(_cell(cells.get(setting, {}).get(metric)) for setting in settings)]
                 for label, cells in by_features.items()
@@ -217,10 +216,6 @@ class Paper(Experiment):
 
 def _rows(metrics: Mapping[str, float]) -> list[Row]:
     return [{"metric": name, "value": float(value)} for name, value in metrics.items()]
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
 
 
 def _cell(numbers: Mapping[str, Any] | None) -> str:

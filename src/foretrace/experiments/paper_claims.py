@@ -5,6 +5,8 @@ its text. How a comparison is tested, and what it takes for a claim to hold: `fo
 """
 
 from collections.abc import Callable, Iterable
+from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -71,29 +73,43 @@ def _unevenness(values: np.ndarray) -> np.ndarray:
     return _first_less_rest(grouped.max(axis=2) / grouped.min(axis=2))
 
 
-def _shuffled(*features: str) -> tuple[Cell, ...]:
-    return tuple(Cell("features", name, "shuffled", "full") for name in features)
+def _cells(
+    experiment: str, names: Iterable[str], settings: Iterable[str], metric: str = "full"
+) -> tuple[Cell, ...]:
+    """Settings of the first name, then those of the next one."""
+    return tuple(Cell(experiment, name, setting, metric) for name, setting in product(names, settings))
 
 
-def _novel(name: str) -> tuple[Cell, ...]:
-    return tuple(Cell("novel-corners", name, pair, "full") for pair in PAIRS)
+def _shuffled(*names: str) -> tuple[Cell, ...]:
+    return _cells("features", names, ["shuffled"])
 
 
-def _sized(name: str, *sizes: str) -> tuple[Cell, ...]:
-    return tuple(Cell("training-size", name, size, "full") for size in sizes)
+def _novel(*names: str) -> tuple[Cell, ...]:
+    return _cells("novel-corners", names, PAIRS)
 
 
-def _accuracy(features: str, *settings: str, novel: bool = False) -> tuple[Cell, ...]:
-    experiment = "support-points-novel" if novel else "support-points"
-    return tuple(Cell(experiment, features, setting, "accuracy") for setting in settings)
+def _sized(names: Iterable[str], *sizes: str) -> tuple[Cell, ...]:
+    return _cells("training-size", names, sizes)
+
+
+def _accuracy(*names: str, share: str = "100") -> tuple[Cell, ...]:
+    return _cells("support-points", names, [share], "accuracy")
+
+
+def _novel_accuracy(*pairs: str) -> tuple[Cell, ...]:
+    return _cells("support-points-novel", ["sp-pred"], pairs, "accuracy")
 
 
 def _others(names: Iterable[str], *left_out: str) -> list[str]:
     return [name for name in names if name not in left_out]
 
 
-def _joined(parts: Iterable[tuple[Cell, ...]]) -> tuple[Cell, ...]:
-    return tuple(cell for part in parts for cell in part)
+def _more(
+    cells: tuple[Cell, ...], label: str = "{0} minus {1}", above: float | None = 0.0, **unit: Any
+) -> Check:
+    """Whether the first cell holds more than the mean of the others, under a label with their features."""
+    names = [cell.features for cell in cells]
+    return Check(label.format(*names), cells, _first_less_rest, above=above, **unit)
 
 
 SUPPORT_POINT_CLAIMS = (
@@ -101,34 +117,31 @@ SUPPORT_POINT_CLAIMS = (
         "support-points-all", "5.1", "Our model reaches up to 93 % accuracy predicting the true support points.",
         "Accuracy of sp-pred with all the training data is not below 93 % by two points.",
         (
-            Check("sp-pred", _accuracy("sp-pred", "100"), _first_less_rest, above=0.93 - TOLERANCE, unit="%"),
-            Check("sp-pred minus sp-rule", _accuracy("sp-pred", "100") + _accuracy("sp-rule", "100"),
-                  _first_less_rest, unit="%"),
+            _more(_accuracy("sp-pred"), "{0}", 0.93 - TOLERANCE, unit="%"),
+            _more(_accuracy("sp-pred", "sp-rule"), above=None, unit="%"),
         ),
     ),
     Claim(
         "support-points-half", "5.1", "It can reach around 90 % accuracy using nearly 50 % of the training data.",
         "Accuracy of sp-pred with half the training data is not below 90 % by two points.",
-        (Check("sp-pred", _accuracy("sp-pred", "50"), _first_less_rest, above=0.90 - TOLERANCE, unit="%"),),
+        (_more(_accuracy("sp-pred", share="50"), "{0}", 0.90 - TOLERANCE, unit="%"),),
     ),
     Claim(
         "support-points-chance", "5.1", "A random guess has an accuracy of 23 %, so the model has learned.",
         "sp-pred with all the training data is right more often than chance. Whether chance is the paper's does "
         "not decide: it depends on the corner counts.",
         (
-            Check("sp-pred minus chance", _accuracy("sp-pred", "100") + _accuracy("chance", "100"),
-                  _first_less_rest, above=0.0, unit="%"),
-            Check("chance", _accuracy("chance", "100"), _first_less_rest, unit="%"),
+            _more(_accuracy("sp-pred", "chance"), unit="%"),
+            _more(_accuracy("chance"), "{0}", None, unit="%"),
         ),
     ),
     Claim(
         "support-points-novel", "5.1", "Around 89 % accuracy for novel shapes, close to the full model's.",
         "Mean accuracy of sp-pred over the four held-out pairs is not below 89 % by two points.",
         (
-            Check("sp-pred, mean of the pairs", _accuracy("sp-pred", *PAIRS, novel=True),
+            Check("sp-pred, mean of the pairs", _novel_accuracy(*PAIRS),
                   lambda values: values.mean(axis=1), above=0.89 - TOLERANCE, unit="%"),
-            *(Check(f"sp-pred, {pair}", _accuracy("sp-pred", pair, novel=True), _first_less_rest, unit="%")
-              for pair in PAIRS),
+            *(_more(_novel_accuracy(pair), f"sp-pred, {pair}", None, unit="%") for pair in PAIRS),
         ),
     ),
 )  # fmt: skip
@@ -138,9 +151,8 @@ FEATURE_CLAIMS = (
         "features-help", "5.2", "The error decreases through unsupervised generic features, and further with others.",
         "No-feature's error is larger than that of each other predictor.",
         (
-            *(Check(f"none minus {name}", _shuffled("none", name), _first_less_rest, above=0.0)
-              for name in PAPER_FEATURES[1:]),
-            Check("none minus sp-rule", _shuffled("none", "sp-rule"), _first_less_rest),
+            *(_more(_shuffled("none", name)) for name in PAPER_FEATURES[1:]),
+            _more(_shuffled("none", "sp-rule"), above=None),
         ),
     ),
     Claim(
@@ -149,17 +161,13 @@ FEATURE_CLAIMS = (
         "predictors do not decide.",
         (
             Check("unsupervised minus supervised", _shuffled(*SUPERVISED, *UNSUPERVISED), _groups_apart(2), above=0.0),
-            *(Check(f"{other} minus {name}", _shuffled(other, name), _first_less_rest)
-              for name in SUPERVISED for other in UNSUPERVISED),
+            *(_more(_shuffled(other, name), above=None) for name in SUPERVISED for other in UNSUPERVISED),
         ),
     ),
     Claim(
         "im-cnn-best-generic", "5.3", "Among the general models, Im-CNN achieves the best accuracy.",
         "Each other generic predictor has a larger error than im-cnn.",
-        tuple(
-            Check(f"{name} minus im-cnn", _shuffled(name, "im-cnn"), _first_less_rest, above=0.0)
-            for name in _others(GENERIC, "im-cnn")
-        ),
+        tuple(_more(_shuffled(name, "im-cnn")) for name in _others(GENERIC, "im-cnn")),
     ),
     Claim(
         "supervised-steadier", "5.2", "Models using unsupervised features have higher variance on error.",
@@ -172,7 +180,7 @@ FEATURE_CLAIMS = (
         "support-points-best", "5.2", "The best accuracy is obtained with real or predicted support points.",
         "Each other predictor of the paper has a larger error than sp-pred and than sp-truth.",
         tuple(
-            Check(f"{other} minus {name}", _shuffled(other, name), _first_less_rest, above=0.0)
+            _more(_shuffled(other, name))
             for name in TASK_SPECIFIC for other in _others(PAPER_FEATURES, *TASK_SPECIFIC)
         ),
     ),
@@ -180,11 +188,8 @@ FEATURE_CLAIMS = (
         "steps-ahead", "5.2", "The number of states predicted per iteration changes the error by less than 5 mm.",
         "For each predictor, the largest error over n = 1 to 5 less the smallest one is below 0.5 cm.",
         tuple(
-            Check(
-                f"{name}, largest minus smallest",
-                (*_shuffled(name), *(Cell("steps-ahead", name, str(n), "full") for n in range(2, 6))),
-                _range, below=0.5,
-            )
+            Check(f"{name}, largest minus smallest", _shuffled(name) + _cells("steps-ahead", [name], "2345"), _range,
+                  below=0.5)
             for name in PAPER_FEATURES
         ),
     ),
@@ -197,8 +202,7 @@ SIZE_CLAIMS = (
         "errors-fall", "5.2", "Errors decrease as the training size increases.",
         "For each predictor the error at 2 % of the data is larger than at 64 %; no-feature does not decide.",
         tuple(
-            Check(f"{name}, 2 % minus 64 %", _sized(name, "2", "64"), _first_less_rest,
-                  above=None if name == "none" else 0.0)
+            _more(_sized([name], "2", "64"), "{0}, 2 % minus 64 %", None if name == "none" else 0.0)
             for name in PAPER_FEATURES
         ),
     ),
@@ -208,7 +212,7 @@ SIZE_CLAIMS = (
         "support points.",
         tuple(
             Check(f"fall of {name} minus mean fall of the others",
-                  _joined(_sized(each, "2", "64") for each in (name, *_SLOW)), _fall, above=0.0)
+                  _sized([name, *_SLOW], "2", "64"), _fall, above=0.0)
             for name in _FAST
         ),
     ),
@@ -216,7 +220,7 @@ SIZE_CLAIMS = (
         "good-with-little-data", "5.2", "SP_truth and SP_pred perform well even with small amount of data.",
         "At 2 % of the data the mean error of the generic predictors is larger than that of sp-pred and of sp-truth.",
         tuple(
-            Check(f"generic minus {name}, 2 %", _joined(_sized(each, "2") for each in (name, *GENERIC)),
+            Check(f"generic minus {name}, 2 %", _sized([name, *GENERIC], "2"),
                   _rest_less_first, above=0.0)
             for name in TASK_SPECIFIC
         ),
@@ -227,9 +231,8 @@ SIZE_CLAIMS = (
         "left of its distance does not decide.",
         (
             Check("fall of im-cnn minus mean fall of support points",
-                  _joined(_sized(each, "2", "64") for each in ("im-cnn", *TASK_SPECIFIC)), _fall, above=0.0),
-            *(Check(f"im-cnn minus support points, {size} %",
-                    _joined(_sized(each, size) for each in ("im-cnn", *TASK_SPECIFIC)), _first_less_rest)
+                  _sized(["im-cnn", *TASK_SPECIFIC], "2", "64"), _fall, above=0.0),
+            *(_more(_sized(["im-cnn", *TASK_SPECIFIC], size), f"im-cnn minus support points, {size} %", None)
               for size in SIZES),
         ),
     ),
@@ -251,7 +254,7 @@ NOVEL_CLAIMS = (
         "the other predictors with features; each one's quotient does not decide.",
         tuple(
             Check(f"largest / smallest, {name} minus mean of the others",
-                  _joined(_novel(each) for each in (name, *UNSUPERVISED, *TASK_SPECIFIC)), _unevenness,
+                  _novel(name, *UNSUPERVISED, *TASK_SPECIFIC), _unevenness,
                   below=0.0, unit="times")
             for name in SUPERVISED
         ) + tuple(
@@ -273,18 +276,17 @@ NOVEL_CLAIMS = (
         "predictors with features. Whether it is the best shape context does not decide.",
         (
             Check("novel / shuffled, sc-800 minus mean of the others",
-                  _joined(_shuffled(each) + _novel(each)
-                          for each in ("sc-800", *_others(PAPER_FEATURES, "none", "sc-800"))),
+                  sum((_shuffled(each) + _novel(each)
+                       for each in ("sc-800", *_others(PAPER_FEATURES, "none", "sc-800"))), ()),
                   _degradation, above=0.0, unit="times"),
-            *(Check(f"{name} minus sc-800, shuffled", _shuffled(name, "sc-800"), _first_less_rest)
-              for name in ("sc-200", "sc-3200")),
+            *(_more(_shuffled(name, "sc-800"), "{0} minus {1}, shuffled", None) for name in ("sc-200", "sc-3200")),
         ),
     ),
     Claim(
         "im-cnn-generalizes-best", "5.3", "Among the general models, Im-CNN achieves the best generalization.",
         "Each other generic predictor has a larger mean error over the held-out pairs than im-cnn.",
         tuple(
-            Check(f"{name} minus im-cnn, mean of the pairs", _novel("im-cnn") + _novel(name), _groups_apart(4),
+            Check(f"{name} minus im-cnn, mean of the pairs", _novel("im-cnn", name), _groups_apart(4),
                   above=0.0)
             for name in _others(GENERIC, "im-cnn")
         ),

@@ -73,9 +73,8 @@ class Predictor(Experiment):
             place = summary
             for name in ("part", "start", "group"):
                 place = place.setdefault(row[name], {})
-            numbers = {name: round(row[name], 5) for name in STATISTICS}
             place.setdefault("count", {})[row["metric"]] = int(row["count"])
-            place[row["metric"]] = numbers
+            place[row["metric"]] = {name: round(row[name], 5) for name in STATISTICS}
         return summary
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:

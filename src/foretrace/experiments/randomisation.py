@@ -233,35 +233,28 @@ class RandomisationExperiment(Experiment):
             summary[features] = {}
             for test, metric in tests_of(rows).items():
                 values = {bar: values_of(rows, features, bar, metric) for bar in BARS}
-                differences = {
-                    name: (values[first] - values[second]).dropna()
-                    for name, (first, second) in CONTRASTS.items()
-                }
+                apart = {name: (values[a] - values[b]).dropna() for name, (a, b) in CONTRASTS.items()}
                 summary[features][test] = {
-                    "errors": {name: _interval(each) for name, each in values.items() if len(each)},
-                    "differences": {name: _interval(each) for name, each in differences.items() if len(each)},
+                    part: {name: _interval(each) for name, each in found.items() if len(each)}
+                    for part, found in (("errors", values), ("differences", apart))
                 }
         return summary
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """Errors and differences as two tables."""
         parts = ["# Plain and varied training data"]
+        below = "Differences in cm within the same seeds; below zero is an improvement."
         for part, columns, sign, words in (
             ("errors", BARS, "", "Errors in cm, means over the seeds [95 % interval]."),
-            (
-                "differences",
-                CONTRASTS,
-                "+",
-                "Differences in cm within the same seeds; below zero is an improvement.",
-            ),
+            ("differences", CONTRASTS, "+", below),
         ):
             lines = [
                 [
-                    f"`{features}`",
+                    f"`{label}`",
                     test,
                     *(mean_with_interval(found[part].get(name), sign=sign) for name in columns),
                 ]
-                for features, tests in summary.items()
+                for label, tests in summary.items()
                 for test, found in tests.items()
             ]
             parts += [words, markdown_table(["Features", "Evaluated on", *columns], lines)]

@@ -11,7 +11,7 @@ contact, with the constants that the data set states; the predictor has the reco
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,8 @@ from foretrace.trajectories import warped_distance
 
 CM = 100.0
 PRINTED_SHOWN = (("pentagon", 1), ("pentagon", 3), ("heptagon", 2), ("heptagon", 6))
+ABOUT_STAND_IN = ("repeats", "seed", "silhouettes", "size", "scale", "prisms", "height")
+"""Options that go with no recordings."""
 DRAWN = {"everyday": "figure-15", "silhouettes": "silhouettes", "prisms": "prisms"}
 """Groups whose masks and errors are drawn, and the name of the picture."""
 
@@ -106,18 +108,17 @@ class Transfer(Experiment):
     trial = TransferTrial
 
     def __post_init__(self) -> None:
-        names = ("repeats", "seed", "silhouettes", "size", "scale", "prisms", "height")
-        idle = [f"--{name}" for name in names if getattr(self, name) is not None]
+        given = {each.name: getattr(self, each.name) for each in fields(self)}
+        given = {name: value for name, value in given.items() if value is not None}
+        idle = [f"--{name}" for name in ABOUT_STAND_IN if name in given]
         if idle and self.recorded is not None:
             raise ResultsError(f"{', '.join(idle)} is about the stand-in: leave it out with --recorded")
         for name, least in (("repeats", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ResultsError(f"--{name} is {value}, it must be at least {least}")
+            if given.get(name, least) < least:
+                raise ResultsError(f"--{name} is {given[name]}, it must be at least {least}")
         for name in ("size", "scale", "height"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ShapeError(f"--{name} is {value}: give a positive length in metres")
+            if not 0 < given.get(name, 1.0) < float("inf"):
+                raise ShapeError(f"--{name} is {given[name]}: give a positive length in metres")
 
     def trials(self) -> Sequence[TransferTrial]:
         """One for each contact."""
@@ -135,18 +136,15 @@ class Transfer(Experiment):
         about = {"model": weights_of(self.predictor), "features": self._predictor.features.label}
         if self.recorded is not None:
             return about | {"recorded": fingerprint(self._dataset.batch())}
-        return about | {
-            "repeats": (self.repeats or 10),
-            "seed": self.seed or 0,
-            "stand_in": asdict(self._stand_in),
-        }
+        drawn = {"repeats": self.repeats or 10, "seed": self.seed or 0}
+        return about | drawn | {"stand_in": asdict(self._stand_in)}
 
     def run(self, trial: TransferTrial, folder: Path) -> Sequence[Row]:
         """A row for each lever-up: distances [cm], and what was drawn in SI units; the first one has paths, too."""
         if self.recorded is not None:
             return self._run_recorded(trial)
         subject = self._subjects[trial.group, trial.object]
-        played = play(subject, trial.contact - 1, self._stand_in, (self.repeats or 10), self.seed or 0)
+        played = play(subject, trial.contact - 1, self._stand_in, self.repeats or 10, self.seed or 0)
         return compare_played(self._predictor, played, subject.hull, paths=trial.group == "printed")
 
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
@@ -163,9 +161,8 @@ class Transfer(Experiment):
         if "paths_cm" in rows:
             drawn = rows.loc[rows["paths_cm"].notna()]
             recorded = drawn.loc[drawn["group"].eq(RECORDED)]
-            shown = drawn.loc[
-                [place in PRINTED_SHOWN for place in zip(drawn["object"], drawn["contact"], strict=True)]
-            ]
+            places = pd.MultiIndex.from_frame(drawn[["object", "contact"]])
+            shown = drawn.loc[places.isin(PRINTED_SHOWN)]
             if len(recorded):
                 note = "The first recording at each edge; the table is grey"
                 figures["figure-14"] = paths_figure(recorded, "recorded", note)
@@ -173,8 +170,8 @@ class Transfer(Experiment):
                 figures["figure-14"] = paths_figure(shown)
         for group, name in DRAWN.items():
             mine = rows.loc[rows["group"].eq(group)]
-            subjects = [self._subjects[key] for key in dict.fromkeys(zip(mine["group"], mine["object"], strict=True))
-                        if key in self._subjects]  # fmt: skip
+            places = [(group, name) for name in mine["object"].unique()]
+            subjects = [self._subjects[place] for place in places if place in self._subjects]
             if subjects:
                 paper = PAPER_OBJECTS if group == "everyday" else {}
                 figures[name] = objects_figure(subjects, mine, self._stand_in, paper)
@@ -197,12 +194,11 @@ class Transfer(Experiment):
             subjects += read_silhouettes(self.silhouettes, size, self.scale, height)
         if self.prisms is not None:
             subjects += read_prisms(self.prisms, height)
-        found = {(subject.group, subject.name): subject for subject in subjects}
-        if len(found) < len(subjects):
-            names = [(subject.group, subject.name) for subject in subjects]
-            group, name = next(each for each in names if names.count(each) > 1)
+        found = {(str(subject.group), subject.name): subject for subject in subjects}
+        if twice := [each for each in subjects if found[each.group, each.name] is not each]:
+            group, name = twice[0].group, twice[0].name
             raise ShapeError(f"two of the {group} are called {name!r}: give every object its own name")
-        return {(str(group), name): subject for (group, name), subject in found.items()}
+        return found
 
     @cached_property
     def _dataset(self) -> Dataset:

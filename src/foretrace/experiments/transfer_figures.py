@@ -212,5 +212,5 @@ def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: s
     middle = (left + right) / 2
     ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
     ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
-    draw_table(ax, 1)
+    draw_table(ax, 1.0)
     mesh(ax)

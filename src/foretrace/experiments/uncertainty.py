@@ -37,15 +37,7 @@ from foretrace.experiments.uncertainty_metrics import (
     SCORES,
     SHOWN_LEVELS,
     UNLIKE,
-    Part,
-    constant_deviations,
-    draw,
-    evaluate_errors,
-    evaluate_observed,
-    evaluate_outcomes,
-    evaluate_regions,
-    futures_of,
-    score,
+    measure,
 )
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
@@ -244,53 +236,6 @@ def split_of(batch: InteractionBatch, setting: str, seed: int, held_out: Collect
     if setting == "novel-shapes":
         return split_by_corner_count(batch.num_corners, held_out, seed)
     return split_by_seed(len(batch), seed, PAPER_SIZES if len(batch) >= sum(PAPER_SIZES) else None)
-
-
-def measure(
-    predictor: OneShotPredictor,
-    batch: InteractionBatch,
-    split: Split,
-    seed: int,
-    samples: int = 100,
-    unlike: InteractionBatch | None = None,
-) -> pd.DataFrame:
-    """All that is measured of one predictor.
-
-    Args:
-        predictor: The predictor.
-        batch: The interactions.
-        split: Those of its training. The validation part fits the forecasts that its samples are compared with.
-        seed: Seed of the samples.
-        samples: Motions drawn at random for each interaction.
-        unlike: Interactions with other physics than those learned from, sampled alike. Of these, only the gain by
-            observed samples is measured; their metrics begin with `UNLIKE`.
-
-    Returns:
-        ``metric``, ``group`` (`uncertainty_metrics.ALL` or an outcome; of ``confusion``, what happened and what was
-        predicted), ``level`` (of a region, or the number of observed samples; else NaN), ``value``. The page on
-        uncertainty explains the metrics.
-    """
-    test, validation = (Part.of(predictor, batch[rows]) for rows in (split.test, split.validation))
-    parts = {"train": split.train, "validation": split.validation, "test": split.test}
-    found = [
-        (f"count_{name}", outcome, np.nan, float(np.sum(batch.outcome[rows] == outcome)))
-        for outcome in predictor.outcomes
-        for name, rows in parts.items()
-    ]
-    imagined = test.imagine(predictor)
-    found += evaluate_outcomes(futures_of(imagined).outcomes(), test.batch.outcome)
-    found += evaluate_errors(imagined, test)
-    found += evaluate_regions(futures_of(imagined), test)
-    mixture = test.mixture(predictor)
-    deviations = constant_deviations(validation.imagine(predictor).com - validation.com, validation.valid)
-    for name, drawn in draw(mixture, imagined.com, deviations, samples, seed):
-        for metric, values in score(drawn, test.com, test.valid).items():
-            found += test.means(f"{name}_{metric}", values)
-    found += evaluate_observed(predictor, test)
-    if unlike is not None:
-        other = Part.of(predictor, unlike[np.isin(unlike.outcome, predictor.outcomes)])
-        found += [(UNLIKE + metric, *row) for metric, *row in evaluate_observed(predictor, other)]
-    return pd.DataFrame(found, columns=["metric", "group", "level", "value"])
 
 
 def test_to_train(rows: pd.DataFrame) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import scoringrules
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +19,7 @@ from foretrace.evaluation.metrics import METRICS
 from foretrace.imagined import LEVELS, Futures, ImaginedBatch
 from foretrace.imagined.context import recorded_context
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.splits import Split
 from foretrace.predictor import OneShotPredictor
 from foretrace.predictor.mixture import Mixture
 from foretrace.predictor.states import decode_poses, encode_states
@@ -106,6 +108,53 @@ class Part:
     def means(self, metric: str, values: np.ndarray, level: float = np.nan) -> Found:
         """Rows of a metric: the mean of its values over each group, one value for each interaction."""
         return [(metric, name, level, float(np.mean(values[mine]))) for name, mine in self.groups.items()]
+
+
+def measure(
+    predictor: OneShotPredictor,
+    batch: InteractionBatch,
+    split: Split,
+    seed: int,
+    samples: int = 100,
+    unlike: InteractionBatch | None = None,
+) -> pd.DataFrame:
+    """All that is measured of one predictor.
+
+    Args:
+        predictor: The predictor.
+        batch: The interactions.
+        split: Those of its training. The validation part fits the forecasts that its samples are compared with.
+        seed: Seed of the samples.
+        samples: Motions drawn at random for each interaction.
+        unlike: Interactions with other physics than those learned from, sampled alike. Of these, only the gain by
+            observed samples is measured; their metrics begin with `UNLIKE`.
+
+    Returns:
+        ``metric``, ``group`` (`ALL` or an outcome; of ``confusion``, what happened and what was
+        predicted), ``level`` (of a region, or the number of observed samples; else NaN), ``value``. The page on
+        uncertainty explains the metrics.
+    """
+    test, validation = (Part.of(predictor, batch[rows]) for rows in (split.test, split.validation))
+    parts = {"train": split.train, "validation": split.validation, "test": split.test}
+    found = [
+        (f"count_{name}", outcome, np.nan, float(np.sum(batch.outcome[rows] == outcome)))
+        for outcome in predictor.outcomes
+        for name, rows in parts.items()
+    ]
+    imagined = test.imagine(predictor)
+    found += evaluate_outcomes(futures_of(imagined).outcomes(), test.batch.outcome)
+    found += evaluate_errors(imagined, test)
+    found += evaluate_regions(futures_of(imagined), test)
+    mixture = test.mixture(predictor)
+    deviations = constant_deviations(validation.imagine(predictor).com - validation.com, validation.valid)
+    for name, drawn in draw(mixture, imagined.com, deviations, samples, seed):
+        for metric, values in score(drawn, test.com, test.valid).items():
+            found += test.means(f"{name}_{metric}", values)
+    found += evaluate_observed(predictor, test)
+    if unlike is not None:
+        other = Part.of(predictor, unlike[np.isin(unlike.outcome, predictor.outcomes)])
+        found += [(UNLIKE + metric, *row) for metric, *row in evaluate_observed(predictor, other)]
+    return pd.DataFrame(found, columns=["metric", "group", "level", "value"])
 
 
 def futures_of(imagined: ImaginedBatch) -> Futures:

@@ -272,7 +272,7 @@ def draw_from_the_side(ax: Axes, scene: Scene, instants: int = 5) -> None:
         draw_path(ax, path[:, [0, 2]] * CM, color, style, width)
     scene.band.draw_in_plane(ax, [0, 2], PREDICTION_COLORS[0])
     (left, right), top = ax.get_xlim(), max(ax.get_ylim()[1], 6.0)
-    draw_table(ax, 50)
+    draw_table(ax, 50.0)
     if scene.tool is not None:
         x, _, z = tool_line(scene.tool[-1])[1] * CM
         ax.text(x, z, "  blade", color=TOOL_COLOR)
