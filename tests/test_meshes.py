@@ -116,10 +116,13 @@ BAD_MESHES = {
     "size 100 m": (BOX.vertices * 1000, BOX.faces),
     "size 0.001 m": (BOX.vertices * 0.01, BOX.faces),
     "height 0 m": (BOX.vertices * [1, 1, 0], BOX.faces),
-    "vertex 0 is .*nan": (np.where(np.indices((8, 3))[0] == 0, np.nan, BOX.vertices), BOX.faces),
+    "vertices .* not finite, nan at .0, ": (
+        np.where(np.indices((8, 3))[0] == 0, np.nan, BOX.vertices),
+        BOX.faces,
+    ),
     "faces name vertices 0 to 107": (BOX.vertices, BOX.faces + np.where(BOX.faces == 7, 100, 0)),
     "empty": (np.zeros((0, 3)), np.zeros((0, 3), dtype=int)),
-    "expected .v, 3.": (BOX.vertices[:, :2], BOX.faces),
+    "must be numbers in the shape": (BOX.vertices[:, :2], BOX.faces),
 }
 
 

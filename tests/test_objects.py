@@ -204,8 +204,8 @@ def test_lists_are_accepted():
 BAD_PRISMS = {
     "2 corners": dict(corners=[[0, 0], [0.1, 0]]),
     "shape": dict(corners=[0.0, 0.1, 0.2]),
-    "table of numbers": dict(corners=[[0, 0], [0.1, "wide"], [0, 0.1]]),
-    "corner 1 is .*nan": dict(corners=[[0, 0], [0.1, np.nan], [0, 0.1]]),
+    "must be numbers in the shape": dict(corners=[[0, 0], [0.1, "wide"], [0, 0.1]]),
+    "corners .* not finite, nan at .1, ": dict(corners=[[0, 0], [0.1, np.nan], [0, 0.1]]),
     "check unit": dict(corners=[[0, 0], [1e300, 0], [0, 1e300]]),
     "finite": dict(corners=[[0, 0], [np.inf, 0], [0, 0.1]]),
     "Self-intersection": dict(corners=[[0, 0], [0.1, 0.1], [0.1, 0], [0, 0.11]]),

@@ -33,10 +33,9 @@ from foretrace.predictor import (
     train_predictor,
 )
 from foretrace.predictor import training as training_module
-from foretrace.predictor.optimizer import parameter_groups
 from foretrace.predictor.run_folder import RunFolder
 from foretrace.predictor.runtime import suitable_threads
-from foretrace.predictor.training import fit_predictor, learning_rate
+from foretrace.predictor.training import fit_predictor, learning_rate, parameter_groups
 from foretrace.trajectories import mean_distance
 
 CONFIG = LstmConfig(features="none", hidden=16, window=6)

@@ -37,8 +37,12 @@ def finite_array(
         raise error(f"{name} must be {wanted}") from None
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         raise error(f"{name} must be {wanted}, not in the shape {array.shape}")
-    if not np.isfinite(array).all():
-        raise error(f"{name} holds a value that is not finite: leave it out or correct it")
+    if not (finite := np.isfinite(array)).all():
+        bad = tuple(np.argwhere(~finite)[0].tolist())
+        place = f" at {bad}" if bad else ""
+        raise error(
+            f"{name} holds a value that is not finite, {array[bad]}{place}: leave it out or correct it"
+        )
     return array
 
 

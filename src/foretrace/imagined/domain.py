@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from foretrace.errors import PredictionError
 from foretrace.interactions.batch import Candidates, InteractionBatch
-from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
+from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 
 LARGEST_GAP = 0.02
 """Largest distance of a contact point from the object's rim, outside or inside [m]."""
@@ -41,14 +41,14 @@ OWN = np.zeros((1, 2)), np.array([[1.0, 0.0]])
 """Contact point and direction of a view's own action."""
 
 
-def check_view(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> None:
+def check_view(view: TopDownView) -> None:
     """Refuse a view that does not show one object, levered at its rim.
 
     Raises:
         PredictionError: See `check_object` and `check_contacts`.
     """
-    check_object(mask, height)
-    check_contacts(mask, *OWN)
+    check_object(view.mask, view.height)
+    check_contacts(view.mask, *OWN)
 
 
 def check_object(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> None:

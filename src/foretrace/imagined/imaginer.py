@@ -22,6 +22,7 @@ from foretrace.imagined.context import (
     recorded_context,
 )
 from foretrace.imagined.domain import (
+    OWN,
     check_contacts,
     check_object,
     check_view,
@@ -129,7 +130,7 @@ class Imaginer(ABC):
         """
         self._check_sight()
         _check_type("view", view, TopDownView)
-        check_view(view.mask, view.height)
+        check_view(view)
         parameters = {}
         if action is not None:
             _check_type("action", action, Action)
@@ -169,7 +170,8 @@ class Imaginer(ABC):
             raise PredictionError(f"observed is {observed!r}: give a number of samples from 0 to {most}")
         for id, mask, height in zip(batch.ids, batch.mask, batch.height, strict=True):
             with _naming(f"interaction {id}: "):
-                check_view(mask, height)
+                check_object(mask, height)
+                check_contacts(mask, *OWN)
         values = recorded_context(batch, self.context)
         com = estimate_com(batch)
         if start == "observed":

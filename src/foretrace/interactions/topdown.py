@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Shaped
 from foretrace.actions import Action, LeverUp
 from foretrace.errors import ActionError, ShapeError, ViewError
 from foretrace.geometry import Numbers, mask_outline
-from foretrace.objects import ObjectModel, read_silhouette, silhouette_origin
+from foretrace.objects import ObjectModel
+from foretrace.objects.silhouette import check_scale, read_silhouette, silhouette_origin
 
 VIEW_SIZE = 128
 """Rows and columns of a view."""
@@ -48,8 +49,7 @@ class TopDownView:
             object.__setattr__(self, name, values)
         scale = self.metres_per_pixel
         if scale != METRES_PER_PIXEL:
-            if not (np.isfinite(scale) and scale > 0):
-                raise ViewError(f"scale of {scale} m per pixel: it must be a positive length")
+            check_scale(scale, ViewError)
             if self.mask[[0, -1]].any() or self.mask[:, [0, -1]].any():
                 raise ViewError(
                     f"the object touches the border of a view of {scale} m per pixel, a part of it may not be seen: "
@@ -106,8 +106,7 @@ class TopDownView:
         Raises:
             ViewError: if the image does not show one whole object, or it does not fit into the window.
         """
-        if not (np.isfinite(metres_per_pixel) and metres_per_pixel > 0):
-            raise ViewError(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
+        check_scale(metres_per_pixel, ViewError)
         try:
             silhouette = read_silhouette(mask)
             action = LeverUp(contact, direction)

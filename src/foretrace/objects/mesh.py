@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError
-from foretrace.geometry import Numbers, convex_hull, inward_normals, polygon_area
+from foretrace.geometry import Numbers, convex_hull, finite_array, inward_normals, polygon_area
 from foretrace.objects.model import (
     Bevel,
     MassProperties,
@@ -118,11 +118,6 @@ class MeshObject(ObjectModel):
         """
         return self._pieces
 
-    @property
-    def support_corners(self) -> Float[np.ndarray, "n 2"]:
-        """The footprint's point nearest to each corner of the outline, in the object frame [m]."""
-        return self._support_corners
-
     def mass_properties(self, density: float) -> MassProperties:
         """Mass, centre of mass and inertia of the mesh itself, without the bevel, for a density [kg/m^3]."""
         mesh = self._mesh
@@ -179,7 +174,8 @@ class MeshObject(ObjectModel):
         return bevelled
 
     @cached_property
-    def _support_corners(self) -> np.ndarray:
+    def support_corners(self) -> Float[np.ndarray, "n 2"]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The footprint's point nearest to each corner of the outline, in the object frame [m]."""
         points = np.concatenate(self._pieces)
         lowest = points[:, 2].min()
         foot = shapely.MultiPoint(points[points[:, 2] < lowest + FOOT_HEIGHT, :2]).convex_hull
@@ -194,18 +190,14 @@ def check_mesh(vertices: Numbers, faces: Numbers) -> Any:
     Raises:
         ShapeError: naming the fault, if the mesh bounds no body.
     """
-    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ShapeError(
-            f"mesh has vertices {vertices.shape} and faces {faces.shape}: expected (v, 3) and (f, 3)"
-        )
+    vertices = finite_array("a table of vertices [m]", vertices, (None, 3), ShapeError)
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise ShapeError(f"faces have the shape {faces.shape}: give three numbers of vertices for each")
     if len(vertices) == 0 or len(faces) == 0:
         raise ShapeError(
             f"mesh with {len(vertices)} vertices and {len(faces)} faces is empty: give a closed surface"
         )
-    if not np.isfinite(vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise ShapeError(f"mesh vertex {bad} is {vertices[bad].tolist()}: every coordinate must be finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ShapeError(
             f"mesh faces name vertices {faces.min()} to {faces.max()}: there are {len(vertices)}"

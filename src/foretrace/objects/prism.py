@@ -9,7 +9,15 @@ from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 
 from foretrace.errors import ShapeError
-from foretrace.geometry import Numbers, clip_polygon, convex_hull, inward_normals, is_convex, polygon_area
+from foretrace.geometry import (
+    Numbers,
+    clip_polygon,
+    convex_hull,
+    finite_array,
+    inward_normals,
+    is_convex,
+    polygon_area,
+)
 from foretrace.objects.model import (
     BEVEL,
     Bevel,
@@ -116,14 +124,6 @@ class Prism(ObjectModel):
         """
         return self._pieces
 
-    @property
-    def support_corners(self) -> Float[np.ndarray, "n 2"]:
-        """Where the bottom face has its corners, one for each corner of the outline, in the object frame [m].
-
-        A corner whose inset lies beyond the bottom face, as at a thin tip, gets the face's nearest point.
-        """
-        return self._support_corners
-
     def mass_properties(self, density: float) -> MassProperties:
         """Exact mass, centre of mass and inertia of the bevelled body for a uniform density [kg/m^3]."""
         return self._unit_mass_properties.scaled(density)
@@ -182,7 +182,11 @@ class Prism(ObjectModel):
         return parts
 
     @cached_property
-    def _support_corners(self) -> np.ndarray:
+    def support_corners(self) -> Float[np.ndarray, "n 2"]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Where the bottom face has its corners, one for each corner of the outline, in the object frame [m].
+
+        A corner whose inset lies beyond the bottom face, as at a thin tip, gets the face's nearest point.
+        """
         normals = inward_normals(self.corners)
         before = np.roll(normals, 1, axis=0)
         # The mitre point m solves normal . m = normal . corner + width for both edges of the corner.
@@ -203,17 +207,9 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     Raises:
         ShapeError: naming the fault, if the corners do not bound a simple polygon.
     """
-    try:
-        corners = np.asarray(corners, dtype=float)
-    except (TypeError, ValueError):
-        raise ShapeError("corners are not an (n, 2) table of numbers: give x and y in metres") from None
-    if corners.ndim != 2 or corners.shape[1] != 2:
-        raise ShapeError(f"corners have shape {corners.shape}: expected (n, 2), x and y in metres")
+    corners = finite_array("a table of corners [m]", corners, (None, 2), ShapeError)
     if len(corners) < 3:
         raise ShapeError(f"polygon with {len(corners)} corners: at least 3 are needed")
-    if not np.isfinite(corners).all():
-        bad = int(np.flatnonzero(~np.isfinite(corners).all(axis=1))[0])
-        raise ShapeError(f"corner {bad} is {corners[bad].tolist()}: every coordinate must be finite")
     if (far := float(np.abs(corners).max())) > LARGEST_COORDINATE:
         raise ShapeError(f"a corner lies {far:.3g} m from the origin: check unit (metres) or scale")
     same = KDTree(corners).query_pairs(SAME_CORNER)

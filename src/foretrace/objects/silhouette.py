@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int, Shaped
 
-from foretrace.errors import ShapeError
+from foretrace.errors import ForetraceError, ShapeError
 from foretrace.geometry import cross, mask_outline
 
 SPECK = 0.01
@@ -80,6 +80,12 @@ def _check_border(found: Bool[np.ndarray, "rows columns"]) -> None:
             )
 
 
+def check_scale(metres_per_pixel: float, error: type[ForetraceError]) -> None:
+    """Refuse an image's scale [m] that is no positive length, by an error of the given class."""
+    if not (np.isfinite(metres_per_pixel) and metres_per_pixel > 0):
+        raise error(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
+
+
 def silhouette_origin(silhouette: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2"]:
     """Centroid (row, column) of a silhouette's pixels: the origin of the object frame."""
     return np.argwhere(silhouette).mean(axis=0)
@@ -105,8 +111,7 @@ def silhouette_polygon(
     Raises:
         ShapeError: if the image does not show one whole object, or the scale is not positive.
     """
-    if not (np.isfinite(metres_per_pixel) and metres_per_pixel > 0):
-        raise ShapeError(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
+    check_scale(metres_per_pixel, ShapeError)
     silhouette = read_silhouette(mask)
     rows, columns = (mask_outline(silhouette) - silhouette_origin(silhouette)).T
     outline = np.column_stack([columns, -rows])[::-1]  # x, y in pixels, counter-clockwise

@@ -6,10 +6,11 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from foretrace.errors import TrainingError
 from foretrace.features.base import FitPart, fast_precision
@@ -23,7 +24,6 @@ from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
 from foretrace.predictor.config import PredictorConfig, TrainConfig
 from foretrace.predictor.display import tensorboard, terminal
-from foretrace.predictor.optimizer import make_optimizer
 from foretrace.predictor.parts import Part, choose_split, outcome_of, prepare
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, Source, fingerprint
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
@@ -33,6 +33,10 @@ from foretrace.trajectories import final_distance, mean_distance
 RUNTIME = ("device", "threads", "precision")
 """Settings that say where a training runs, not what it ends with."""
 
+FULL_RATE_INPUTS = 256
+"""Units with more inputs than this learn at a lower rate."""
+FEATURE_DECAY = 1 / 800
+"""Weight decay per feature."""
 PIECE = 2048
 """Rows that are normalised or imagined together."""
 IN_MEMORY = 4_000
@@ -187,7 +191,8 @@ class _Training:
         predictor.set_normalisation(mean, scale, train.source.times)
         predictor.set_context(train.context)
         self.effects = self._effects_of(train, in_place=train.large)
-        self.optimizer = make_optimizer(predictor)
+        # The loss of a state's small change is small: the usual epsilon of 1e-8 would outweigh its gradient.
+        self.optimizer = torch.optim.AdamW(parameter_groups(predictor), eps=1e-12, fused=True)
 
     def run(
         self,
@@ -311,6 +316,28 @@ class _Training:
             "validation_full_cm": 100 * float(np.mean(mean_distance(imagined[..., :3], truth))),
             "validation_final_cm": 100 * float(np.mean(final_distance(imagined[..., :3], truth))),
         }
+
+
+def parameter_groups(predictor: EffectPredictor) -> list[dict[str, Any]]:
+    """What is trainable, grouped by its share of the learning rate and by its weight decay.
+
+    One step of Adam changes every weight by about the learning rate, and so what a unit sees by that times its
+    number of inputs. From ``FULL_RATE_INPUTS`` inputs on the rate is therefore lowered in proportion (Yang et
+    al., 2021, "Tensor programs V"). The weights of the features keep the full rate and decay in proportion to
+    the number of features instead (Loshchilov and Hutter, 2019): thousands of them tell every training object
+    apart, four do not.
+    """
+    readers = {id(parameter) for parameter in predictor.feature_weights}
+    groups: dict[tuple[float, float], list[nn.Parameter]] = {}
+    for parameter in predictor.parameters():
+        if parameter.requires_grad:
+            inputs = parameter[0].numel() if parameter.dim() > 1 else 0
+            if id(parameter) in readers:
+                key = 1.0, FEATURE_DECAY * inputs
+            else:
+                key = min(1.0, FULL_RATE_INPUTS / max(1, inputs)), 0.0
+            groups.setdefault(key, []).append(parameter)
+    return [{"params": p, "share": share, "weight_decay": decay} for (share, decay), p in groups.items()]
 
 
 def _outcomes_of(source: Source, split: Split) -> tuple[str, ...]:
