@@ -20,12 +20,11 @@ from foretrace.interactions.record import Effect, Outcome
 from foretrace.objects.body import Body
 from foretrace.simulation import tool
 from foretrace.simulation.collect import CollectConfig, num_trials, trial
-from foretrace.simulation.engine import BUILT_IN
 from foretrace.simulation.free_motion import simulate_free_motion
 from foretrace.simulation.lever_up import SimulationConfig, make_engine, simulate_lever_up
 
 G = 9.81
-ENGINES = tuple(BUILT_IN)
+ENGINES = ("mujoco", "bullet")
 LYING = [0.0, 0.0, 0.03, float(np.sqrt(0.5)), float(np.sqrt(0.5)), 0.0, 0.0]
 """A cylinder of 3 cm radius on its side, axis along -y."""
 FLAT_BOX = Body.box((0.10, 0.08, 0.04), 0.3)
