@@ -3,6 +3,8 @@
 Every message names the offending value and says what to do; the command line prints it as one line.
 """
 
+from numbers import Real
+
 
 class ForetraceError(Exception):
     """Base of every error that foretrace raises on purpose."""
@@ -58,3 +60,23 @@ class RobotError(ForetraceError):
 
 class ExportError(ForetraceError):
     """An export that cannot be written: nothing chosen, the target exists, a library is missing, uneven sampling."""
+
+
+def check_type(name: str, value: object, kinds: type | tuple[type, ...], error: type[ForetraceError]) -> None:
+    """Refuse a value of another type.
+
+    Args:
+        name: Name of the value in the message.
+        value: The value.
+        kinds: The types that it may have.
+        error: The class to raise.
+    """
+    if not isinstance(value, kinds):
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+        wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
+        raise error(f"{name} is a {type(value).__name__}: give a {wanted}")
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is one real number; True and False are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)

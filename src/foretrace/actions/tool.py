@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal
 
-from foretrace.errors import ActionError
+from foretrace.errors import ActionError, check_type, is_number
 from foretrace.registry import Registry
 
 Point = tuple[float, float, float]
@@ -76,6 +76,7 @@ class Tool(ABC):
         Raises:
             ActionError: There is no such tool, or a dimension is missing or impossible.
         """
+        check_type("tool", content, Mapping, ActionError)
         kind = TOOLS.find(content.get("label"))
         try:
             return kind(**{name: value for name, value in content.items() if name != "label"})
@@ -164,6 +165,5 @@ def check_ranges(what: str, thing: Any, limits: Mapping[str, tuple[float, float]
     """
     for name, (low, high) in limits.items():
         value = getattr(thing, name)
-        number = isinstance(value, int | float) or getattr(value, "ndim", None) == 0
-        if not (number and low <= value <= high):
+        if not (is_number(value) and low <= value <= high):
             raise ActionError(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: give SI units")

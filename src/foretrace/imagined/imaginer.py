@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Action
-from foretrace.errors import PredictionError
+from foretrace.errors import PredictionError, check_type
 from foretrace.geometry import Numbers
 from foretrace.imagined.context import (
     PARAMETERS,
@@ -20,7 +20,14 @@ from foretrace.imagined.context import (
     parameters_of,
     recorded_context,
 )
-from foretrace.imagined.domain import OWN, check_contacts, check_object, check_view
+from foretrace.imagined.domain import (
+    OWN,
+    check_arrays,
+    check_com,
+    check_contacts,
+    check_object,
+    check_view,
+)
 from foretrace.imagined.futures import ImaginedBatch, ImaginedEffect
 from foretrace.imagined.observed import SAME_TIME, ObservedMotion, observed_motion, rotations_since_rest
 from foretrace.imagined.scenes import Scenes, estimate_com
@@ -92,11 +99,11 @@ class Imaginer(ABC):
                 motion cannot be used.
         """
         self._check_sight()
-        _check_type("view", view, TopDownView)
+        check_type("view", view, TopDownView, PredictionError)
         check_view(view)
         parameters = {}
         if action is not None:
-            _check_type("action", action, Action)
+            check_type("action", action, Action, PredictionError)
             parameters = parameters_of([action])
         values = given_context(self.context, context, parameters)
         batch = InteractionBatch.from_views([view])
@@ -104,6 +111,7 @@ class Imaginer(ABC):
         if com is None and motion is not None and motion.com is not None:
             com = motion.com[0]
         start = estimate_com(batch)[0] if com is None else _point(com)
+        check_com(view, start)
         seen = None
         if motion is not None:
             self._check_observes()
@@ -125,7 +133,8 @@ class Imaginer(ABC):
         Raises:
             PredictionError: As `imagine`, naming the interaction; or no first sample was recorded.
         """
-        _check_type("batch", batch, InteractionBatch)
+        check_type("batch", batch, InteractionBatch, PredictionError)
+        check_arrays(batch.mask, batch.height)
         if start not in STARTS:
             raise PredictionError(f"start is {start!r}: choose from {', '.join(STARTS)}")
         most = len(self.sample_times) - 1
@@ -171,19 +180,21 @@ class Imaginer(ABC):
             PredictionError: As `imagine`, naming the candidate; or there is none.
         """
         self._check_sight()
-        _check_type("view", view, TopDownView)
+        check_type("view", view, TopDownView, PredictionError)
         check_object(view.mask, view.height)
+        check_type("actions", actions, Iterable, PredictionError)
         actions = tuple(actions)
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")
         for k, action in enumerate(actions):
-            _check_type(f"candidate {k}", action, Action)
+            check_type(f"candidate {k}", action, Action, PredictionError)
         candidates = Candidates(view, actions)
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
         values = given_context(self.context, context, parameters, len(actions))
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
+        check_com(view, middle)
         return self._answer(Scenes(candidates, candidates.enter(middle), values), parameters)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
@@ -233,11 +244,6 @@ def _naming(name: str) -> Iterator[None]:
         yield
     except PredictionError as error:
         raise PredictionError(f"{name}{error}") from error
-
-
-def _check_type(name: str, value: object, kind: type) -> None:
-    if not isinstance(value, kind):
-        raise PredictionError(f"{name} is a {type(value).__name__}: give a {kind.__name__}")
 
 
 def _point(com: Numbers) -> Float[np.ndarray, "3"]:

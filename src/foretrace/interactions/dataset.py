@@ -5,6 +5,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +18,8 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import ACTIONS, FAILED, action_transform
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, ShapeError, check_type
+from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import TopDownView
@@ -75,7 +77,12 @@ class InteractionBatch:
         return len(self.ids)
 
     def __getitem__(self, rows: Any) -> "InteractionBatch":
-        """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all."""
+        """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all.
+
+        Raises:
+            RowError: There are no such rows.
+        """
+        rows = rows if isinstance(rows, slice) else _chosen_rows(len(self), rows)
         kept = {
             f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("times", "parameters")
         }
@@ -94,6 +101,10 @@ class InteractionBatch:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
+        check_type("interactions", interactions, (Sequence, Dataset), DatasetError)
+        interactions = list(interactions)
+        for k, interaction in enumerate(interactions):
+            check_type(f"interaction {k}", interaction, Interaction, DatasetError)
         descriptions = [json.dumps(interaction.object.to_dict()) for interaction in interactions]
         numbers = {description: k for k, description in enumerate(dict.fromkeys(descriptions))}
         rows = [
@@ -117,6 +128,9 @@ class InteractionBatch:
             times: Times at which the effect will be imagined [s]; by default none.
             corners: Corners of each object in the action frame [m], if known.
         """
+        check_type("views", views, Sequence, DatasetError)
+        for k, view in enumerate(views):
+            check_type(f"view {k}", view, TopDownView, DatasetError)
         n, times = len(views), np.zeros(0) if times is None else times
         corners = [np.zeros((0, 2))] * n if corners is None else corners
         return cls(
@@ -135,6 +149,31 @@ class InteractionBatch:
             outcome=_outcome_array([""] * n),
             parameters={},
         )
+
+
+class RowError(DatasetError, IndexError):
+    """Rows that a data set or a batch does not have."""
+
+
+def _chosen_rows(number: int, rows: Any) -> Int[np.ndarray, " chosen"]:
+    """Numbers of the chosen rows.
+
+    Raises:
+        RowError: There are no such rows.
+    """
+    try:
+        chosen = np.arange(number)[[] if isinstance(rows, list | tuple) and not rows else rows]
+    except (IndexError, TypeError, ValueError) as reason:
+        shown = " ".join(repr(rows).split())
+        raise RowError(
+            f"{shown:.60} chooses no rows of {number} ({reason}): give a row number, a slice, row numbers, or a "
+            "boolean array of all rows"
+        ) from None
+    if chosen.ndim != 1:
+        raise RowError(
+            f"{' '.join(repr(rows).split()):.60} chooses no rows of {number}: give row numbers in one list"
+        )
+    return chosen
 
 
 class Dataset:
@@ -167,7 +206,7 @@ class Dataset:
         Raises:
             DatasetError: Nothing there, another format version, or a missing or corrupt shard.
         """
-        path = Path(path)
+        path = as_path(path, DatasetError)
         manifest = storage.read_manifest(path)
         shards = _Shards(path, {name: entry.get("sha256") for name, entry in manifest["shards"].items()})
         if missing := storage.missing_shards(manifest):
@@ -194,12 +233,12 @@ class Dataset:
         return len(self._places)
 
     def __getitem__(self, rows: Any) -> Any:
-        if isinstance(rows, int | np.integer):
+        if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
             if not -len(self) <= rows < len(self):
-                raise IndexError(f"interaction {rows} of {len(self)}")
+                raise RowError(f"there is no row {rows} among {len(self)}: take 0 to {len(self) - 1}")
             number, row = self._places[rows]
             return self._decode(self._shards.table(int(number)).slice(row, 1).to_pylist()[0])
-        return self._view(np.arange(len(self))[rows])
+        return self._view(_chosen_rows(len(self), rows))
 
     def __iter__(self) -> Iterator[Interaction]:
         for start in range(0, len(self), ROWS_AT_ONCE):
@@ -225,7 +264,13 @@ class Dataset:
         for name, wanted in conditions.items():
             column = self._column(name)
             if callable(wanted):
-                kept &= np.asarray(wanted(column), dtype=bool)
+                found = np.asarray(wanted(column))
+                if found.dtype != bool or found.shape not in ((), column.shape):
+                    raise DatasetError(
+                        f"the function for {name} returns {found.dtype} of shape {found.shape}: let it return "
+                        f"booleans of shape {column.shape}"
+                    )
+                kept &= found
                 continue
             several = isinstance(wanted, list | tuple | set | frozenset | range | np.ndarray)
             values = list(wanted) if several else [wanted]
@@ -233,6 +278,12 @@ class Dataset:
                 odd := [value for value in values if value not in self._outcome_names()]
             ):
                 raise DatasetError(f"no outcome {odd[0]!r}: choose from {', '.join(self._outcome_names())}")
+            texts = column.dtype.kind in "OU"
+            for value in values:
+                if isinstance(value, str) != texts or not np.isscalar(value):
+                    raise DatasetError(
+                        f"{name} is compared with {value!r}: give {'a text' if texts else 'a number'}"
+                    )
             kept &= np.isin(column, values)
         return self if kept.all() else self._view(np.flatnonzero(kept))
 
@@ -261,6 +312,8 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise DatasetError(f"size of a batch is {size!r}: give a number of rows from 1 on")
         for start in range(0, len(self), size):
             yield self._batch(self._rows(slice(start, start + size)), self.times)
             pa.default_memory_pool().release_unused()
@@ -328,8 +381,9 @@ class Dataset:
             table = self.index if name in INDEX_COLUMNS else self._rows(slice(None), [name])
             return table[name].to_numpy()
         if name not in self.parameters:
-            names = ", ".join([*scalars, *self.parameters])
-            raise DatasetError(f"no column {name!r} to filter by; there are {names}")
+            names = [*scalars, *self.parameters]
+            close = get_close_matches(name, names, n=3) or names
+            raise DatasetError(f"no column {name!r} to filter by: choose from {', '.join(close)}")
         return self.parameters[name]
 
     @cached_property
@@ -369,7 +423,12 @@ class Dataset:
         if description not in self._objects:
             if len(self._objects) >= MOST_OBJECTS:
                 self._objects.clear()
-            self._objects[description] = object_from_dict(json.loads(description))
+            try:
+                self._objects[description] = object_from_dict(json.loads(description))
+            except (ValueError, AttributeError, ShapeError) as reason:
+                raise DatasetError(
+                    f"{self.path} describes an object that cannot be read ({reason}): check it with `foretrace data`"
+                ) from reason
         return self._objects[description]
 
 

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, check_type
 from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
-from foretrace.files import short_hash
+from foretrace.files import as_path, short_hash
 from foretrace.imagined.context import recorded_context
 from foretrace.imagined.domain import measure, ranges_of
 from foretrace.interactions.dataset import Dataset, InteractionBatch, count_outcomes
@@ -150,13 +150,16 @@ def train_predictor(
             folder is in use, or the loss is no longer finite.
     """
     training = _loop_settings(predictor, training)
+    check_type("data", data, (InteractionBatch, Dataset), TrainingError)
+    check_type("split", split, (Split, type(None)), TrainingError)
     source = data.batch() if isinstance(data, Dataset) and len(data) <= LARGE else data
-    folder = RunFolder(out)
+    folder = RunFolder(as_path(out, TrainingError))
     threads = training.threads or (folder.threads if resume else None)
     with _made(predictor, training, source, threads) as made:
         training = replace(training, outcomes=training.outcomes or made.outcomes or (str(Outcome.LEVERED),))
         outcomes, lengths = _overview(source)
         split = _choose_split(outcomes, lengths, training) if split is None else split
+        _check_split(split, lengths)
         made.learned_from = _outcomes_of(outcomes[split.train])
         described = {name: value for name, value in asdict(training).items() if name not in RUNTIME}
         described |= {"data": fingerprint(source, made.context), "rows": _hash_split(split)}
@@ -352,13 +355,8 @@ class _Training:
 
 
 def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: TrainConfig | None) -> TrainConfig:
-    for name, value, kinds in (
-        ("predictor", predictor, (PredictorConfig, EffectPredictor)),
-        ("training", training, (TrainConfig, type(None))),
-    ):
-        if not isinstance(value, kinds):
-            wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
-            raise TrainingError(f"{name} is a {type(value).__name__}: give a {wanted}")
+    check_type("predictor", predictor, (PredictorConfig, EffectPredictor), TrainingError)
+    check_type("training", training, (TrainConfig, type(None)), TrainingError)
     config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
     return config.training if training is None else training
 
@@ -386,6 +384,27 @@ def _choose_split(outcome: np.ndarray, lengths: np.ndarray, training: TrainConfi
         )
     drawn = split_by_seed(len(usable), training.seed, training.split)
     return Split(usable[drawn.train], usable[drawn.validation], usable[drawn.test])
+
+
+def _check_split(split: Split, lengths: np.ndarray) -> None:
+    """Refuse rows that the data do not have, and parts from which nothing can be learned."""
+    for name, rows in asdict(split).items():
+        if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "iu" or rows.ndim != 1:
+            raise TrainingError(f"{name} part of the split is {rows!r}: give an array of row numbers")
+        if len(rows) and not (rows.min() >= 0 and rows.max() < len(lengths)):
+            worst = rows.min() if rows.min() < 0 else rows.max()
+            raise TrainingError(
+                f"{name} part of the split has row {worst}: the data have {len(lengths)} rows"
+            )
+        if name == "test":
+            continue
+        if not len(rows):
+            raise TrainingError(f"{name} part of the split is empty: give at least one interaction")
+        if (lengths[rows] < 2).any():
+            row = rows[lengths[rows] < 2][0]
+            raise TrainingError(
+                f"{name} part of the split has row {row} of fewer than two samples before a slip: leave it out"
+            )
 
 
 def _hash_split(split: Split) -> str:

@@ -19,8 +19,17 @@ import pyarrow as pa
 from rich.console import Console
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
-from foretrace.errors import DatasetError, ForetraceError, SimulationError
-from foretrace.files import LOCK, as_json, first_difference, remove_partial, sole_writer, versions_of
+from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type
+from foretrace.files import (
+    LOCK,
+    as_json,
+    as_path,
+    first_difference,
+    make_folder,
+    remove_partial,
+    sole_writer,
+    versions_of,
+)
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import count_outcomes
 from foretrace.interactions.record import Interaction
@@ -66,11 +75,17 @@ class CollectConfig:
     """The screwdriver."""
 
     def __post_init__(self) -> None:
-        for name in ("objects", "contacts_per_edge"):
-            if not 1 <= getattr(self, name) <= MOST:
-                raise SimulationError(f"{name} is {getattr(self, name)}: give a number from 1 to {MOST}")
-        if self.seed < 0:
-            raise SimulationError(f"seed is {self.seed}, it must not be negative")
+        for name, least, most in (
+            ("objects", 1, MOST),
+            ("contacts_per_edge", 1, MOST),
+            ("seed", 0, 2**63 - 1),
+        ):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise SimulationError(f"{name} is {value!r}: give a whole number from {least} to {most}")
+        kinds = {"simulation": SimulationConfig, "path": ToolPath, "randomisation": Randomisation}
+        for name, kind in (kinds | {"recipe": str, "tool": Screwdriver}).items():
+            check_type(name, getattr(self, name), kind, SimulationError)
         if self.recipe not in RECIPES:
             raise SimulationError(f"recipe {self.recipe!r} is unknown: choose one of {', '.join(RECIPES)}")
 
@@ -141,7 +156,8 @@ def collect(
         DatasetError: The folder holds something else, or a data set of another configuration.
         SimulationError: A trial could not be simulated at all.
     """
-    out, console = Path(out), console or Console(stderr=True)
+    check_type("config", config, CollectConfig, SimulationError)
+    out, console = as_path(out, DatasetError), console or Console(stderr=True)
     workers = count_workers(workers, SimulationError)
     _prepare_folder(out)
     with sole_writer(out, DatasetError):
@@ -162,7 +178,7 @@ def _prepare_folder(out: Path) -> None:
         strangers = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith(own))
         if strangers:
             raise DatasetError(f"{out} holds {strangers[0]} and is no data set; choose a new folder")
-    (out / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
+    make_folder(out / storage.SHARD_FOLDER, DatasetError)
 
 
 def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import FAILED, Action, Motion, ToolPath
-from foretrace.errors import ActionError, SimulationError
+from foretrace.errors import ActionError, SimulationError, check_type, is_number
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -30,6 +30,8 @@ from foretrace.objects import ObjectModel
 from foretrace.simulation.engine import make_engine
 
 CAMERAS = ("exact", "rgbd")
+SHORTEST, LONGEST = 1e-5, 1.0
+"""Limits of time steps and sample periods [s]."""
 PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
 """What is simulated: friction coefficients, densities of anything solid [kg/m^3]."""
 FALL_DEPTH = 0.5
@@ -56,8 +58,20 @@ class SimulationConfig:
     """Friction and density."""
 
     def __post_init__(self) -> None:
+        check_type("physics", self.physics, Physics, SimulationError)
+        numbers = {name: getattr(self, name) for name in ("timestep", "sample_period", "watch_time")}
+        for name, value in (numbers | asdict(self.physics)).items():
+            if not is_number(value) and not (name == "table_edge" and value is None):
+                raise SimulationError(f"{name} is {value!r}: give a number")
         if not 0 <= self.watch_time <= 60:
             raise SimulationError(f"watch_time = {self.watch_time} s is outside 0 to 60 s")
+        if not SHORTEST <= self.timestep <= self.sample_period <= LONGEST:
+            raise SimulationError(
+                f"timestep = {self.timestep} s and sample_period = {self.sample_period} s: give at least {SHORTEST} s, "
+                f"at most {LONGEST} s, and the time step not longer than the sample period"
+            )
+        for name in ("engine", "embodiment"):
+            check_type(name, getattr(self, name), str, SimulationError)
         if self.physics.table_edge is not None and not 0 < self.physics.table_edge <= 10:
             raise SimulationError(f"table_edge = {self.physics.table_edge} m: give a distance up to 10 m")
         if not 0 <= self.physics.rolling_friction <= 0.1:
@@ -105,6 +119,11 @@ def simulate_lever_up(
     """
     if not isinstance(action, Action):
         raise ActionError(f"{action!r} is no action: give a LeverUp or another Action")
+    check_type("obj", obj, ObjectModel, SimulationError)
+    check_type("config", config, SimulationConfig, SimulationError)
+    check_type("execution_error", execution_error, ExecutionOffset, SimulationError)
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+        raise SimulationError(f"seed is {seed!r}: give a whole number from 0 on")
     action.check_contact(obj)
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
@@ -179,6 +198,7 @@ def replay(interaction: Interaction) -> Interaction:
     Raises:
         SimulationError: The interaction is a recording of a real one, or its engine is not installed.
     """
+    check_type("interaction", interaction, Interaction, SimulationError)
     made = interaction.provenance
     if made.source != "simulated":
         raise SimulationError(
