@@ -3,7 +3,7 @@
 Every message names the offending value and says what to do; the command line prints it as one line.
 """
 
-from numbers import Real
+from numbers import Integral, Real
 
 
 class ForetraceError(Exception):
@@ -80,3 +80,8 @@ def check_type(name: str, value: object, kinds: type | tuple[type, ...], error: 
 def is_number(value: object) -> bool:
     """Whether a value is one real number; True and False are none."""
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def is_whole(value: object, least: int, most: int) -> bool:
+    """Whether a value is a whole number within limits; True and False are none."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions.motion import FAILED, Judgement, Motion
 from foretrace.actions.tool import Tool
-from foretrace.errors import ActionError, check_type, is_number
+from foretrace.errors import ActionError, check_type, is_number, is_whole
 from foretrace.geometry import Numbers, inward_normals
 from foretrace.objects import ObjectModel
 from foretrace.registry import Registry
@@ -141,8 +141,7 @@ class Action(ABC):
         """
         check_type("obj", obj, ObjectModel, ActionError)
         num_edges = len(obj.corners)
-        whole = isinstance(edge, int | np.integer) and not isinstance(edge, bool)
-        if not whole or not 0 <= edge < num_edges:
+        if not is_whole(edge, 0, num_edges - 1):
             raise ActionError(
                 f"edge {edge!r} of an object with {num_edges} edges: choose 0 to {num_edges - 1}"
             )

@@ -105,6 +105,8 @@ def check_object(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "1
         raise PredictionError(
             f"a height in the view is {highest:g} m, more than {TALLEST:g} m: give metres, or check the camera's pose"
         )
+    if highest == 0:
+        raise PredictionError("every height in the view is 0: give the object's height, in metres")
     if lowest < 0:
         raise PredictionError(
             f"a height in the view is {lowest:.4f} m, below the table: check the camera's pose"

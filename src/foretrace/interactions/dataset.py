@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import ACTIONS, FAILED, action_transform
-from foretrace.errors import DatasetError, ShapeError, check_type
+from foretrace.errors import DatasetError, ShapeError, check_type, is_whole
 from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
@@ -312,7 +312,7 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        if not is_whole(size, 1, 2**63 - 1):
             raise DatasetError(f"size of a batch is {size!r}: give a number of rows from 1 on")
         for start in range(0, len(self), size):
             yield self._batch(self._rows(slice(start, start + size)), self.times)

@@ -48,6 +48,10 @@ class TopDownView:
                 values = np.array(getattr(self, name), dtype=dtype)
             except (TypeError, ValueError):
                 raise ViewError(f"{name} is {getattr(self, name)!r}: give an array of numbers") from None
+            if name == "mask" and np.isnan(given := np.asarray(self.mask, dtype=float)).any():
+                raise ViewError(
+                    f"mask has {np.isnan(given).sum()} values that are NaN: give 0 beside the object"
+                )
             if values.shape != (VIEW_SIZE, VIEW_SIZE):
                 raise ViewError(f"{name} of shape {values.shape}: expected ({VIEW_SIZE}, {VIEW_SIZE}) pixels")
             object.__setattr__(self, name, values)

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from foretrace.errors import CheckpointError, TrainingError
-from foretrace.files import as_json, as_path, make_folder, atomic_path, read_versioned, write_json
+from foretrace.files import as_json, as_path, atomic_path, make_folder, read_versioned, write_json
 from foretrace.imagined.domain import read_ranges
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.base import PREDICTORS, EffectPredictor

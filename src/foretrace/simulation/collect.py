@@ -19,7 +19,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
-from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type
+from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type, is_whole
 from foretrace.files import (
     LOCK,
     as_json,
@@ -81,7 +81,7 @@ class CollectConfig:
             ("seed", 0, 2**63 - 1),
         ):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            if not is_whole(value, least, most):
                 raise SimulationError(f"{name} is {value!r}: give a whole number from {least} to {most}")
         kinds = {"simulation": SimulationConfig, "path": ToolPath, "randomisation": Randomisation}
         for name, kind in (kinds | {"recipe": str, "tool": Screwdriver}).items():

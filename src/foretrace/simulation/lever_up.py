@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import FAILED, Action, Motion, ToolPath
-from foretrace.errors import ActionError, SimulationError, check_type, is_number
+from foretrace.errors import ActionError, SimulationError, check_type, is_number, is_whole
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -30,6 +30,7 @@ from foretrace.objects import ObjectModel
 from foretrace.simulation.engine import make_engine
 
 CAMERAS = ("exact", "rgbd")
+LARGEST_SEED = 2**63 - 1
 SHORTEST, LONGEST = 1e-5, 1.0
 """Limits of time steps and sample periods [s]."""
 PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
@@ -118,12 +119,12 @@ def simulate_lever_up(
         ViewError: If the object does not fit in the view.
     """
     if not isinstance(action, Action):
-        raise ActionError(f"{action!r} is no action: give a LeverUp or another Action")
+        raise ActionError(f"action is a {type(action).__name__}: give a LeverUp or another Action")
     check_type("obj", obj, ObjectModel, SimulationError)
     check_type("config", config, SimulationConfig, SimulationError)
     check_type("execution_error", execution_error, ExecutionOffset, SimulationError)
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise SimulationError(f"seed is {seed!r}: give a whole number from 0 on")
+    if not is_whole(seed, 0, LARGEST_SEED):
+        raise SimulationError(f"seed is {seed!r}: give a whole number from 0 to {LARGEST_SEED}")
     action.check_contact(obj)
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
