@@ -15,6 +15,7 @@ from foretrace.interactions.splits import Split
 from foretrace.predictor import EffectPredictor, PredictorConfig
 from foretrace.simulation.collect import CollectConfig, collect
 
+pytestmark = pytest.mark.usefixtures("untyped")
 BOX = ft.Box(0.15, 0.14, 0.02)
 ACTION = ft.LeverUp.at_edge(BOX, 0)
 VIEW = ft.TopDownView.of(BOX, ACTION)
@@ -150,10 +151,12 @@ TRAININGS = {
     "None is no path": {"out": None},
     "cannot be made (": {"out": "file/run"},
     "split is a tuple": {"split": (1, 2, 3)},
-    "train part of the split is empty": {"split": split(train=np.arange(0))},
-    "train part of the split has row 99: the data have 8 rows": {"split": split(train=np.array([99]))},
-    "test part of the split has row -1": {"split": split(test=np.array([-1]))},
-    "validation part of the split is array([0.5])": {"split": split(validation=np.array([0.5]))},
+    "train part of the split is empty": {"split": lambda: split(train=np.arange(0))},
+    "train part of the split has row 99: the data have 8 rows": {
+        "split": lambda: split(train=np.array([99]))
+    },
+    "test part of the split has row -1": {"split": lambda: split(test=np.array([-1]))},
+    "validation part of the split is array([0.5])": {"split": lambda: split(validation=np.array([0.5]))},
 }
 
 
@@ -163,7 +166,8 @@ def test_bad_trainings_are_refused_in_one_line(message, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     batch = fake_batch(np.random.default_rng(0), 8)
     given = {"data": batch, "predictor": LSTM, "out": "run", "training": LOOP, "progress": False}
-    check(TrainingError, message, lambda: ft.train_predictor(**(given | TRAININGS[message])))
+    given |= {name: value() if callable(value) else value for name, value in TRAININGS[message].items()}
+    check(TrainingError, message, lambda: ft.train_predictor(**given))
 
 
 def test_a_predictor_needs_a_config_of_its_own(registered):

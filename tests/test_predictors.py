@@ -319,7 +319,7 @@ NONSENSE = {
 
 
 @pytest.mark.parametrize("message", NONSENSE)
-def test_nonsense_is_refused(predictor, message):
+def test_nonsense_is_refused(predictor, message, untyped):
     if any(word in message for word in ("interaction", "recorded", "-3", "batch")):
         predictor.context, context = (), predictor.context
         try:
