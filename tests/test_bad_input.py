@@ -1,5 +1,7 @@
 """Values of another type, size or shape at the doors of the Python interface: one table for each kind of error."""
 
+# pyright: reportArgumentType=false
+
 import json
 import shutil
 from dataclasses import replace

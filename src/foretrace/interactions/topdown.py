@@ -243,7 +243,7 @@ def as_points(points: object) -> Float[np.ndarray, "k 3"]:
     try:
         array = np.array(points, dtype=float)
     except (TypeError, ValueError):
-        array = np.zeros(0)
+        array = np.zeros((0, 0))
     if array.ndim != 2 or array.shape[1] != 3:
         raise ViewError(f"points of shape {np.shape(points)}: give numbers in the shape (k, 3) [m]")  # pyright: ignore
     return array
