@@ -33,6 +33,16 @@ def registered():
         registry._entries = entries
 
 
+@pytest.fixture
+def untyped():
+    """Arguments reach the code whatever their type, as they do for users; elsewhere the suite checks types."""
+    import jaxtyping
+
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write the golden files anew, then look at the diff"

@@ -189,10 +189,8 @@ def test_another_identity_is_refused_with_the_first_difference(case: Case, monke
 
 @pytest.mark.parametrize("label", SUMMARIES)
 def test_an_unknown_option_or_a_file_in_the_way_is_no_traceback(label: str, tmp_path: Path, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        cli.main(["evaluate", label, "--levitate"])
-    assert stopped.value.code == 2
-    capsys.readouterr()
+    assert cli.main(["evaluate", label, "--levitate"]) == 2
+    assert f"--levitate; `foretrace evaluate {label} --help`" in capsys.readouterr().err
 
 
 # --- the mechanism --------------------------------------------------------------------------------------------

@@ -290,13 +290,37 @@ NONSENSE = {
     "has no recorded centre of mass: take start='estimated'": lambda p, **more: p.imagine_batch(
         InteractionBatch.from_views([VIEW])
     ),
+    "context is 0.5: give values by name": lambda p, **more: p.imagine(VIEW, context=0.5),
+    "context is 'friction': give values by name": lambda p, **more: p.imagine(VIEW, context="friction"),
+    "view is a ndarray: give a TopDownView": lambda p, **more: p.imagine(VIEW.mask, **more),
+    "action is a str: give a Action": lambda p, **more: p.imagine(VIEW, "lever-up", **more),
+    "actions is a LeverUp: give a Iterable": lambda p, **more: p.imagine_candidates(VIEW, OWN, **more),
+    "candidate 1 is a NoneType": lambda p, **more: p.imagine_candidates(VIEW, [OWN, None], **more),
+    "batch is a TopDownView": lambda p, **more: p.imagine_batch(VIEW),
+    "the batch is empty": lambda p, **more: p.imagine_batch(InteractionBatch.from_views([])),
+    "mask of the batch has the type float64": lambda p, **more: p.imagine_batch(
+        replace(InteractionBatch.from_views([VIEW]), mask=VIEW.mask[None] * 1.0)
+    ),
+    r"mask and height of the batch have the shapes \(1, 64, 128\)": lambda p, **more: p.imagine_batch(
+        replace(InteractionBatch.from_views([VIEW]), mask=VIEW.mask[None, :64])
+    ),
+    r"rest \[5.0, 0.0, 0.0\] m lies \d+ cm outside the object": lambda p, **more: p.imagine(
+        VIEW, com=[5.0, 0.0, 0.0], **more
+    ),
+    r"rest \[0.05, 0.0, -1.0\] m lies 100 cm outside": lambda p, **more: p.imagine_candidates(
+        VIEW, [OWN], com=[0.05, 0.0, -1.0], **more
+    ),
+    "a height in the view is 20 m, more than 2 m": lambda p, **more: p.imagine(
+        TopDownView(VIEW.mask, VIEW.height * 1000), **more
+    ),
+    "every height in the view is 0": lambda p, **more: p.imagine(TopDownView(VIEW.mask, VIEW.height * 0), **more),
     "not on 'colour': leave it out of context": lambda p, context: p.imagine(VIEW, context=context | {"colour": 3.0}),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("message", NONSENSE)
-def test_nonsense_is_refused(predictor, message):
-    if "interaction" in message or "recorded" in message or "-3" in message:
+def test_nonsense_is_refused(predictor, message, untyped):
+    if any(word in message for word in ("interaction", "recorded", "-3", "batch")):
         predictor.context, context = (), predictor.context
         try:
             with pytest.raises(PredictionError, match=message):

@@ -280,7 +280,7 @@ def test_images_of_another_scale_are_resampled(scale):
 
 @pytest.mark.parametrize("scale", [0.0, -0.003, np.nan])
 def test_impossible_scales_are_refused(scale):
-    with pytest.raises(ViewError, match="it must be a positive length"):
+    with pytest.raises(ViewError, match=r"give a length from 1e-06 to 0.1 m"):
         TopDownView(np.zeros((128, 128), bool), np.zeros((128, 128)), scale)
 
 

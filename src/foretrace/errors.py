@@ -4,6 +4,7 @@ Every message names the offending value and says what to do; the command line pr
 """
 
 from collections.abc import Mapping
+from numbers import Integral, Real
 from typing import Any
 
 
@@ -88,6 +89,31 @@ def check_ranges(
     """
     for name, (low, high) in limits.items():
         value = getattr(thing, name)
-        number = isinstance(value, int | float) or getattr(value, "ndim", None) == 0
+        number = is_number(value) or getattr(value, "ndim", None) == 0
         if not (number and low <= value <= high):
             raise error(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: {remedy}")
+
+
+def check_type(name: str, value: object, kinds: type | tuple[type, ...], error: type[ForetraceError]) -> None:
+    """Refuse a value of another type.
+
+    Args:
+        name: Name of the value in the message.
+        value: The value.
+        kinds: The types that it may have.
+        error: The class to raise.
+    """
+    if not isinstance(value, kinds):
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+        wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
+        raise error(f"{name} is a {type(value).__name__}: give a {wanted}")
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is one real number; True and False are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def is_whole(value: object, least: int, most: int) -> bool:
+    """Whether a value is a whole number within limits; True and False are none."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most

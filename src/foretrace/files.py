@@ -17,6 +17,31 @@ PARTIAL = ".partial"
 """Ending of a file that is being written; what has it is the rest of an interrupted run."""
 
 
+def as_path(path: Any, error: type[ForetraceError]) -> Path:
+    """A path that a caller gives.
+
+    Raises:
+        ForetraceError: Of the given class: it is no path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise error(f"{path!r} is no path: give the name of a file or folder")
+    return Path(path)
+
+
+def make_folder(folder: Path, error: type[ForetraceError]) -> None:
+    """Make a folder and those above it, unless they exist.
+
+    Raises:
+        ForetraceError: Of the given class: the system refuses it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        raise error(
+            f"folder {folder} cannot be made ({reason.strerror or reason}): choose another one"
+        ) from None
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """A name to write to; the file gets its own name at the end of the block, or is removed after an error.

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions.motion import FAILED, Judgement, Motion
 from foretrace.actions.tool import Tool
-from foretrace.errors import ActionError
+from foretrace.errors import ActionError, check_type, is_number, is_whole
 from foretrace.geometry import Numbers, inward_normals
 from foretrace.objects import ObjectModel
 from foretrace.registry import Registry
@@ -21,6 +21,8 @@ CORNER_MARGIN = 0.001
 """A contact point snapped to the outline keeps this distance from the corners [m]."""
 CONTACT_TOLERANCE = 0.005
 """A contact may lie this far from the outline, as when it was measured with an error [m]."""
+FARTHEST = 100.0
+"""A contact with a larger coordinate is a mistake, such as one in other units [m]."""
 UNIT_TOLERANCE = 1e-9
 """A stored direction differs from unit length by less than this."""
 
@@ -70,8 +72,13 @@ class Action(ABC):
         contact = plane_vector("contact", self.contact)
         direction = plane_vector("direction", self.direction)
         length = np.linalg.norm(direction)
-        if length < 1e-9:
-            raise ActionError(f"direction {direction.tolist()} has no length: give a vector into the object")
+        if not 1e-9 <= length < np.inf:
+            wrong = "has no length" if length < 1e-9 else "is too long"
+            raise ActionError(f"direction {direction.tolist()} {wrong}: give a unit vector into the object")
+        if (far := np.abs(contact).max()) > FARTHEST:
+            raise ActionError(
+                f"contact {contact.tolist()} lies {far:g} m away: give metres, up to {FARTHEST:g} m"
+            )
         self._place(contact, direction / length)
         for name, kind in _kinds(type(self)).items():
             if not isinstance(getattr(self, name), kind):
@@ -132,11 +139,14 @@ class Action(ABC):
         Raises:
             ActionError: If there is no such edge or the fraction leaves it.
         """
+        check_type("obj", obj, ObjectModel, ActionError)
         num_edges = len(obj.corners)
-        if not 0 <= edge < num_edges:
-            raise ActionError(f"edge {edge} of an object with {num_edges} edges: choose 0 to {num_edges - 1}")
-        if not 0 < fraction < 1:
-            raise ActionError(f"fraction {fraction} of an edge: choose one between 0 and 1, both excluded")
+        if not is_whole(edge, 0, num_edges - 1):
+            raise ActionError(
+                f"edge {edge!r} of an object with {num_edges} edges: choose 0 to {num_edges - 1}"
+            )
+        if not is_number(fraction) or not 0 < fraction < 1:
+            raise ActionError(f"fraction {fraction!r} of an edge: choose one between 0 and 1, both excluded")
         start, stop = obj.corners[edge], obj.corners[(edge + 1) % num_edges]
         return cls(start + fraction * (stop - start), inward_normals(obj.corners)[edge], **settings)
 
@@ -155,6 +165,7 @@ class Action(ABC):
         Raises:
             ActionError: If the point is not finite.
         """
+        check_type("obj", obj, ObjectModel, ActionError)
         point = plane_vector("contact point", point)
         starts, stops = obj.corners, np.roll(obj.corners, -1, axis=0)
         lengths = np.linalg.norm(stops - starts, axis=1)
@@ -182,6 +193,9 @@ class Action(ABC):
 
     def moved(self: Placed, ahead: float, left: float, turn: float) -> Placed:
         """The action shifted along its direction and to its left [m], then turned to the left [rad]."""
+        for name, value in (("ahead", ahead), ("left", left), ("turn", turn)):
+            if not is_number(value):
+                raise ActionError(f"{name} is {value!r}: give a number of metres or radians")
         x, y = self.direction
         contact = self.contact + ahead * np.array([x, y]) + left * np.array([-y, x])
         c, s = np.cos(turn), np.sin(turn)
@@ -212,6 +226,7 @@ class Action(ABC):
         Raises:
             ActionError: There is no such action, or an entry is missing or impossible.
         """
+        check_type("action", content, Mapping, ActionError)
         kind = ACTIONS.find(content.get("label"))
         try:
             path = _kinds(kind)["path"](**content["path"])
@@ -258,7 +273,7 @@ def plane_vector(name: str, values: Any) -> Float[np.ndarray, "2"]:
     except (TypeError, ValueError):
         vector = np.array([np.nan])
     if vector.shape != (2,) or not np.isfinite(vector).all():
-        shown = np.asarray(values, dtype=object).tolist()
+        shown = " ".join(str(np.asarray(values, dtype=object).tolist()).split())
         raise ActionError(f"{name} {shown}: expected two finite numbers, object frame")
     return vector
 

@@ -11,7 +11,7 @@ from foretrace.actions.base import Action, minimum_jerk
 from foretrace.actions.lever_up_judge import Outcome, judge_lever_up
 from foretrace.actions.motion import FAILED, Judgement, Motion
 from foretrace.actions.tool import Screwdriver
-from foretrace.errors import ActionError, check_ranges
+from foretrace.errors import ActionError, check_ranges, is_number
 from foretrace.objects import ObjectModel
 
 APPROACH = (0.0035, 0.002, 0.3)
@@ -88,8 +88,8 @@ class ToolPath:
         Raises:
             ActionError: If the speed is not above 0, or too high.
         """
-        if not speed > 0:
-            raise ActionError(f"tool path: speed = {speed} times the nominal one: give a number above 0")
+        if not is_number(speed) or not speed > 0:
+            raise ActionError(f"tool path: speed = {speed!r} times the nominal one: give a number above 0")
         return replace(self, insert_time=self.insert_time / speed, lift_time=self.lift_time / speed)
 
     def at(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3"]:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.errors import ActionError, check_ranges
+from foretrace.errors import ActionError, check_ranges, check_type
 from foretrace.registry import Registry
 
 Point = tuple[float, float, float]
@@ -96,6 +96,7 @@ class Tool(ABC):
         Raises:
             ActionError: There is no such tool, or a dimension is missing or impossible.
         """
+        check_type("tool", content, Mapping, ActionError)
         kind = TOOLS.find(content.get("label"))
         try:
             return kind(**{name: value for name, value in content.items() if name != "label"})

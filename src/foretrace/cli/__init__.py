@@ -91,8 +91,8 @@ def read(arguments: Sequence[str]) -> Ready:
     """The command that arguments ask for, ready to run.
 
     Raises:
-        ForetraceError: There is no such command, or its options do not go together.
-        SystemExit: Help was asked for and has been printed; or the options cannot be read.
+        ForetraceError: There is no such command, or its options cannot be read or do not go together.
+        SystemExit: Help was asked for and has been printed.
     """
     about = "Predict how an object will move before the robot touches it."
     return parse(COMMANDS, arguments, "foretrace", about)

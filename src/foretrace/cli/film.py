@@ -64,6 +64,8 @@ def film(
     )
     config = replace(config, camera=camera, simulation=simulation)
     obj, action = shown.object, shown.action
+    if not isinstance(action, LeverUp):
+        raise SimulationError(f"interaction {id} is a {action.label}: only lever-ups can be filmed")
     if board:
         _film_board(out / "board", board, camera, seed)
     truth = record_lever_up(obj, action, out, config, seed=seed)

@@ -7,10 +7,12 @@ from docstrings. What all commands have in common is decided here: how options l
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
+from io import StringIO
 from shutil import get_terminal_size
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 Ready = Callable[[], int | None]
 """A command with its options; returns the exit status."""
+USAGE = 2
+"""Exit status of options that cannot be read."""
 ADAPTATIONS = "adaptations"
 """Attribute of a function: how fields of dataclasses among its parameters differ from its options."""
 T = TypeVar("T", bound=Callable[..., Any])
@@ -105,8 +109,8 @@ def parse(entries: Mapping[str, Entry], words: Sequence[str], program: str, abou
         about: What the program does, for its help.
 
     Raises:
-        CommandError: There is no such command.
-        SystemExit: Help was asked for and has been printed; or the options cannot be read.
+        CommandError: There is no such command, or its options cannot be read.
+        SystemExit: Help was asked for and has been printed.
     """
     name, *rest = [*words, ""]
     if name in ("-h", "--help", ""):
@@ -124,25 +128,44 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
     """A command with the options in words.
 
     Raises:
-        SystemExit: Help was asked for and has been printed; or the options cannot be read.
+        CommandError: The options cannot be read.
+        SystemExit: Help was asked for and has been printed.
     """
     import tyro
 
     documentation = inspect.getdoc(command) or ""
-    ready: Any = tyro.cli(
-        command,
-        prog=program,
-        description=_wrap(_clean(documentation.split("\nArgs:\n")[0].strip())),
-        args=list(words),
-        registry=_registry(getattr(command, ADAPTATIONS, Adaptations())),
-        config=(
-            tyro.conf.DisallowNone,
-            tyro.conf.FlagCreatePairsOff,
-            tyro.conf.HelptextFromCommentsOff,
-            tyro.conf.PositionalMetavarFromFieldName,
-        ),
-    )
+    told = StringIO()
+    try:
+        with redirect_stderr(told):
+            ready: Any = tyro.cli(
+                command,
+                prog=program,
+                description=_wrap(_clean(documentation.split("\nArgs:\n")[0].strip())),
+                args=list(words),
+                registry=_registry(getattr(command, ADAPTATIONS, Adaptations())),
+                config=(
+                    tyro.conf.DisallowNone,
+                    tyro.conf.FlagCreatePairsOff,
+                    tyro.conf.HelptextFromCommentsOff,
+                    tyro.conf.PositionalMetavarFromFieldName,
+                ),
+            )
+    except SystemExit as end:
+        if end.code == USAGE and told.getvalue():
+            raise CommandError(_in_one_line(told.getvalue(), program)) from None
+        raise
     return ready
+
+
+def _in_one_line(told: str, program: str) -> str:
+    """What tyro says in a box with a title, a message, and sections about what was meant and where help is."""
+    lines = [line.strip("\u2502\u256d\u256e\u2570\u256f \n") for line in told.splitlines()[1:]]
+    message, *others = "\n".join(lines).split("\n" + "\u2500" * 10)
+    parts = [" ".join(message.split()).rstrip(".")]
+    meant = [line.strip() for part in others if "Perhaps you meant" in part for line in part.splitlines()]
+    if names := [line for line in meant if line.startswith("-")]:
+        parts.append(f"perhaps {names[0]} is meant")
+    return "; ".join([*parts, f"`{program} --help` lists the options"])
 
 
 def _list(entries: Mapping[str, Entry], program: str, about: str, status: int) -> int:

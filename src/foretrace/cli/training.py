@@ -113,7 +113,7 @@ def feature_settings(features: type[FeatureExtractor], config_class: type[Predic
 def _value(option: str, words: Sequence[str]) -> str | None:
     """The last value of an option that is written ``--option value`` or ``--option=value``."""
     value = None
-    for word, following in zip(words, [*words[1:], None], strict=True):
+    for word, following in zip(words, [*words[1:], None], strict=False):
         name, equals, inside = word.partition("=")
         if name == option:
             value = inside if equals else following

@@ -179,7 +179,9 @@ def make_features(label: str, **options: Option) -> FeatureExtractor:
     try:
         return extractor(**options)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TrainingError(f"{label} with options {options}: {str(error).splitlines()[0]}") from error
+        raise TrainingError(
+            f"{label} cannot be made with {options} ({str(error).splitlines()[0]}): change or leave out an option"
+        ) from error
 
 
 class NoFeatures(FeatureExtractor):

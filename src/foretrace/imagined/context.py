@@ -129,7 +129,9 @@ def given_context(
         PredictionError: A value is missing, is no finite number, contradicts an action's path, or is none that the
             predictor is conditioned on.
     """
-    context = {} if context is None else dict(context)
+    context = {} if context is None else context
+    if not isinstance(context, Mapping):
+        raise PredictionError(f"context is {context!r}: give values by name, as {{'friction': 0.8}}")
     if missing := [name for name in names if name not in parameters and name not in context]:
         wanted = ", ".join(f"{name!r}: value {CONTEXT[name]}" for name in names)
         raise PredictionError(

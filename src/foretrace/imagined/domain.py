@@ -13,6 +13,8 @@ from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW
 
 LARGEST_GAP = 0.02
 """Largest distance of a contact point from the object's rim, outside or inside [m]."""
+TALLEST = 2.0
+"""A greater height is a mistake, such as one in other units [m]."""
 RELEVANT_SHARE = 0.05
 """A spot in the mask with more than this share of the largest one's pixels is an object of its own."""
 QUANTILES = (0.01, 0.99)
@@ -51,6 +53,39 @@ def check_view(view: TopDownView) -> None:
     check_contacts(view.mask, *OWN)
 
 
+def check_arrays(mask: Any, height: Any) -> None:
+    """Refuse masks and heights of many views that are of another shape or type.
+
+    Raises:
+        PredictionError: They are not (batch, 128, 128), the masks boolean; or there is no view.
+    """
+    if mask.ndim != 3 or mask.shape != height.shape or mask.shape[1:] != (VIEW_SIZE, VIEW_SIZE):
+        raise PredictionError(
+            f"mask and height of the batch have the shapes {mask.shape} and {height.shape}: give (batch, {VIEW_SIZE}, "
+            f"{VIEW_SIZE}), and of one interaction batch[k : k + 1]"
+        )
+    if mask.dtype != bool:
+        raise PredictionError(f"mask of the batch has the type {mask.dtype}: give booleans")
+    if not len(mask):
+        raise PredictionError("the batch is empty: give at least one interaction")
+
+
+def check_com(view: TopDownView, com: Float[np.ndarray, "3"]) -> None:
+    """Refuse a centre of mass that does not lie in the object of a view.
+
+    Raises:
+        PredictionError: It lies more than ``LARGEST_GAP`` beside, above or below it.
+    """
+    corners = view.to_metres(np.argwhere(view.mask).astype(float))
+    low = np.array([*corners.min(axis=0), 0.0])
+    high = np.array([*corners.max(axis=0), float(view.height.max())])
+    if (off := float(np.maximum(low - com, com - high).max())) > LARGEST_GAP:
+        raise PredictionError(
+            f"the centre of mass at rest {np.round(com, 4).tolist()} m lies {100 * off:.3g} cm outside the object in "
+            "the view: give that of this object, in the frame of the view"
+        )
+
+
 def check_object(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> None:
     """Refuse a view that does not show one object.
 
@@ -66,6 +101,12 @@ def check_object(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "1
     lowest, highest = float(height.min()), float(height.max())
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise PredictionError("a height in the view is not finite: put 0 where no height was measured")
+    if highest > TALLEST:
+        raise PredictionError(
+            f"a height in the view is {highest:g} m, more than {TALLEST:g} m: give metres, or check the camera's pose"
+        )
+    if highest == 0:
+        raise PredictionError("every height in the view is 0: give the object's height, in metres")
     if lowest < 0:
         raise PredictionError(
             f"a height in the view is {lowest:.4f} m, below the table: check the camera's pose"

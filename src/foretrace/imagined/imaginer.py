@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Action
-from foretrace.errors import PredictionError
+from foretrace.errors import PredictionError, check_type
 from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined.context import (
     PARAMETERS,
@@ -23,6 +23,8 @@ from foretrace.imagined.context import (
 )
 from foretrace.imagined.domain import (
     OWN,
+    check_arrays,
+    check_com,
     check_contacts,
     check_object,
     check_view,
@@ -129,11 +131,11 @@ class Imaginer(ABC):
                 motion cannot be used.
         """
         self._check_sight()
-        _check_type("view", view, TopDownView)
+        check_type("view", view, TopDownView, PredictionError)
         check_view(view)
         parameters = {}
         if action is not None:
-            _check_type("action", action, Action)
+            check_type("action", action, Action, PredictionError)
             parameters = parameters_of([action])
         values = given_context(self.context, context, parameters)
         batch = InteractionBatch.from_views([view])
@@ -141,6 +143,7 @@ class Imaginer(ABC):
         if com is None and motion is not None and motion.com is not None:
             com = motion.com[0]
         start = estimate_com(batch)[0] if com is None else _point(com)
+        check_com(view, start)
         seen = None
         if motion is not None:
             self._check_observes()
@@ -162,7 +165,8 @@ class Imaginer(ABC):
         Raises:
             PredictionError: As `imagine`, naming the interaction; or no first sample was recorded.
         """
-        _check_type("batch", batch, InteractionBatch)
+        check_type("batch", batch, InteractionBatch, PredictionError)
+        check_arrays(batch.mask, batch.height)
         if start not in STARTS:
             raise PredictionError(f"start is {start!r}: choose from {', '.join(STARTS)}")
         most = len(self.sample_times) - 1
@@ -208,21 +212,21 @@ class Imaginer(ABC):
             PredictionError: As `imagine`, naming the candidate; or there is none.
         """
         self._check_sight()
-        _check_type("view", view, TopDownView)
+        check_type("view", view, TopDownView, PredictionError)
         check_object(view.mask, view.height)
-        if not isinstance(actions, Iterable):
-            raise PredictionError(f"actions of type {type(actions).__name__}: give a list of actions")
+        check_type("actions", actions, Iterable, PredictionError)
         actions = tuple(actions)
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")
         for k, action in enumerate(actions):
-            _check_type(f"candidate {k}", action, Action)
+            check_type(f"candidate {k}", action, Action, PredictionError)
         candidates = Candidates(view, actions)
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
         values = given_context(self.context, context, parameters, len(actions))
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
+        check_com(view, middle)
         return self._answer(Scenes(candidates, candidates.enter(middle), values), parameters)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
@@ -272,11 +276,6 @@ def _naming(name: str) -> Iterator[None]:
         yield
     except PredictionError as error:
         raise PredictionError(f"{name}{error}") from error
-
-
-def _check_type(name: str, value: object, kind: type) -> None:
-    if not isinstance(value, kind):
-        raise PredictionError(f"{name} of type {type(value).__name__}: give {kind.__name__}")
 
 
 def _point(com: Numbers) -> Float[np.ndarray, "3"]:

@@ -12,7 +12,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import Action, action_transform
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, RowError, check_type
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
@@ -57,7 +57,12 @@ class InteractionBatch:
         return len(self.ids)
 
     def __getitem__(self, rows: Any) -> "InteractionBatch":
-        """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all."""
+        """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all.
+
+        Raises:
+            RowError: There are no such rows.
+        """
+        rows = rows if isinstance(rows, slice) else chosen_rows(len(self), rows)
         kept = {
             f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("times", "parameters")
         }
@@ -76,6 +81,10 @@ class InteractionBatch:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
+        check_type("interactions", interactions, Iterable, DatasetError)
+        interactions = list(interactions)
+        for k, interaction in enumerate(interactions):
+            check_type(f"interaction {k}", interaction, Interaction, DatasetError)
         descriptions = [json.dumps(interaction.object.to_dict()) for interaction in interactions]
         numbers = {description: k for k, description in enumerate(dict.fromkeys(descriptions))}
         rows = [
@@ -100,6 +109,9 @@ class InteractionBatch:
             times: Times at which the effect will be imagined [s]; by default none.
             corners: Corners of each object in the action frame [m], if known.
         """
+        check_type("views", views, Sequence, DatasetError)
+        for k, view in enumerate(views):
+            check_type(f"view {k}", view, TopDownView, DatasetError)
         n, times = len(views), np.zeros(0) if times is None else times
         corners = [np.zeros((0, 2))] * n if corners is None else corners
         return cls(
@@ -234,3 +246,24 @@ def _lists(table: pa.Table, name: str, width: int) -> list[np.ndarray]:
     column = table[name].combine_chunks()
     flat, offsets = column.values.to_numpy(zero_copy_only=False), column.offsets.to_numpy()
     return [flat[a:b].reshape(-1, width) for a, b in pairwise(offsets)]
+
+
+def chosen_rows(number: int, rows: Any) -> Int[np.ndarray, " chosen"]:
+    """Numbers of the chosen rows.
+
+    Raises:
+        RowError: There are no such rows.
+    """
+    try:
+        chosen = np.arange(number)[[] if isinstance(rows, list | tuple) and not rows else rows]
+    except (IndexError, TypeError, ValueError) as reason:
+        shown = " ".join(repr(rows).split())
+        raise RowError(
+            f"{shown:.60} chooses no rows of {number} ({reason}): give a row number, a slice, row numbers, or a "
+            "boolean array of all rows"
+        ) from None
+    if chosen.ndim != 1:
+        raise RowError(
+            f"{' '.join(repr(rows).split()):.60} chooses no rows of {number}: give row numbers in one list"
+        )
+    return chosen

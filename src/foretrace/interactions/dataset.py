@@ -4,6 +4,7 @@ import json
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from foretrace.actions import ACTIONS, FAILED
-from foretrace.errors import DatasetError, RowError
+from foretrace.errors import DatasetError, RowError, ShapeError, is_whole
+from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
-from foretrace.interactions.batch import batch_of, common_times
+from foretrace.interactions.batch import batch_of, chosen_rows, common_times
 from foretrace.interactions.record import Interaction
 from foretrace.objects import ObjectModel, object_from_dict
 
@@ -66,7 +68,7 @@ class Dataset:
         Raises:
             DatasetError: Nothing there, another format version, or a missing or corrupt shard.
         """
-        path = Path(path)
+        path = as_path(path, DatasetError)
         manifest = storage.read_manifest(path)
         shards = _Shards(path, {name: entry.get("sha256") for name, entry in manifest["shards"].items()})
         if missing := storage.missing_shards(manifest):
@@ -93,17 +95,12 @@ class Dataset:
         return len(self._places)
 
     def __getitem__(self, rows: Any) -> Any:
-        if isinstance(rows, int | np.integer):
+        if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
             if not -len(self) <= rows < len(self):
-                raise RowError(f"row {rows} of {self.path}: choose one of the {len(self)} rows from 0 on")
+                raise RowError(f"there is no row {rows} among {len(self)}: take 0 to {len(self) - 1}")
             number, row = self._places[rows]
             return self._decode(self._shards.table(int(number)).slice(row, 1).to_pylist()[0])
-        try:
-            return self._view(np.arange(len(self))[rows])
-        except IndexError as error:
-            raise RowError(
-                f"rows {rows!r} of {self.path}: give a number, a slice or an array of numbers"
-            ) from error
+        return self._view(chosen_rows(len(self), rows))
 
     def __iter__(self) -> Iterator[Interaction]:
         for table in self._pieces():
@@ -129,7 +126,13 @@ class Dataset:
         for name, wanted in conditions.items():
             column = self._column(name)
             if callable(wanted):
-                kept &= np.asarray(wanted(column), dtype=bool)
+                found = np.asarray(wanted(column))
+                if found.dtype != bool or found.shape not in ((), column.shape):
+                    raise DatasetError(
+                        f"the function for {name} returns {found.dtype} of shape {found.shape}: let it return "
+                        f"booleans of shape {column.shape}"
+                    )
+                kept &= found
                 continue
             several = isinstance(wanted, list | tuple | set | frozenset | range | np.ndarray)
             values = list(wanted) if several else [wanted]
@@ -137,6 +140,12 @@ class Dataset:
                 odd := [value for value in values if value not in self._outcome_names()]
             ):
                 raise DatasetError(f"no outcome {odd[0]!r}: choose from {', '.join(self._outcome_names())}")
+            texts = column.dtype.kind in "OU"
+            for value in values:
+                if isinstance(value, str) != texts or not np.isscalar(value):
+                    raise DatasetError(
+                        f"{name} is compared with {value!r}: give {'a text' if texts else 'a number'}"
+                    )
             kept &= np.isin(column, values)
         return self if kept.all() else self._view(np.flatnonzero(kept))
 
@@ -165,6 +174,8 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
+        if not is_whole(size, 1, 2**63 - 1):
+            raise DatasetError(f"size of a batch is {size!r}: give a number of rows from 1 on")
         for table in self._pieces(size=size):
             yield self._batch(table)
             pa.default_memory_pool().release_unused()
@@ -221,8 +232,9 @@ class Dataset:
             table = self.index if name in INDEX_COLUMNS else self._rows(slice(None), [name])
             return table[name].to_numpy()
         if name not in self.parameters:
-            names = ", ".join([*scalars, *self.parameters])
-            raise DatasetError(f"no column {name!r} to filter by; there are {names}")
+            names = [*scalars, *self.parameters]
+            close = get_close_matches(name, names, n=3) or names
+            raise DatasetError(f"no column {name!r} to filter by: choose from {', '.join(close)}")
         return self.parameters[name]
 
     @cached_property
@@ -266,7 +278,12 @@ class Dataset:
         if description not in self._objects:
             if len(self._objects) >= MOST_OBJECTS:
                 self._objects.clear()
-            self._objects[description] = object_from_dict(json.loads(description))
+            try:
+                self._objects[description] = object_from_dict(json.loads(description))
+            except (ValueError, AttributeError, ShapeError) as reason:
+                raise DatasetError(
+                    f"{self.path} describes an object that cannot be read ({reason}): check it with `foretrace data`"
+                ) from reason
         return self._objects[description]
 
 

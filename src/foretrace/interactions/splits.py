@@ -41,7 +41,7 @@ def split_by_seed(n: int, seed: int, sizes: tuple[int, int, int] | None = PAPER_
     if sum(sizes) > n:
         raise TrainingError(
             f"a split of {sizes[0]} + {sizes[1]} + {sizes[2]} needs {sum(sizes)} interactions, the data has "
-            f"{n}: simulate more objects, or use the paper's proportions of what there is (sizes=None)"
+            f"{n}: simulate more objects, or use the paper's proportions of what there is (split=None, or no --split)"
         )
     _require_filled(*sizes)
     train, validation, test, _ = np.split(np.random.default_rng(seed).permutation(n), np.cumsum(sizes))

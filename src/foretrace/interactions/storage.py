@@ -327,6 +327,12 @@ def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
     for name, kind in (("shards", dict), ("configuration", dict), ("num_trials", int), ("shard_size", int)):
         if not isinstance(manifest.get(name), kind):
             raise DatasetError(f"{path} is damaged (its {name} is {manifest.get(name)!r}); {remedy}")
+    for name, least in (("num_trials", 0), ("shard_size", 1)):
+        if manifest[name] < least:
+            raise DatasetError(f"{path} is damaged (its {name} is {manifest[name]}); {remedy}")
+    for name, entry in manifest["shards"].items():
+        if not isinstance(entry, dict) or not isinstance(entry.get("sha256"), str | type(None)):
+            raise DatasetError(f"{path} is damaged (its entry of {name} is {entry!r}); {remedy}")
     return manifest
 
 

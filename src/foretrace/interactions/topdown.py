@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from foretrace.actions import Action, LeverUp
-from foretrace.errors import ActionError, ShapeError, ViewError
+from foretrace.errors import ActionError, ShapeError, ViewError, check_type, is_number
 from foretrace.geometry import Numbers, mask_outline
 from foretrace.objects import ObjectModel
 from foretrace.objects.silhouette import check_scale, read_silhouette, silhouette_origin
@@ -21,6 +21,8 @@ VIEW_SIZE = 128
 """Rows and columns of a view."""
 METRES_PER_PIXEL = 0.0032
 """Side of a pixel [m]."""
+FINEST, COARSEST = 1e-6, 0.1
+"""Sides of the smallest and of the largest pixels of pictures [m]."""
 ROWS_AHEAD = 96
 """Rows of pixels ahead of the contact point; the rest lies behind it."""
 CONTACT_PIXEL = np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5])
@@ -43,7 +45,14 @@ class TopDownView:
 
     def __post_init__(self) -> None:
         for name, dtype in (("mask", bool), ("height", np.float32)):
-            values = np.array(getattr(self, name), dtype=dtype)
+            try:
+                values = np.array(getattr(self, name), dtype=dtype)
+            except (TypeError, ValueError):
+                raise ViewError(f"{name} is {getattr(self, name)!r}: give an array of numbers") from None
+            if name == "mask" and np.isnan(given := np.asarray(self.mask, dtype=float)).any():
+                raise ViewError(
+                    f"mask has {np.isnan(given).sum()} values that are NaN: give 0 beside the object"
+                )
             if values.shape != (VIEW_SIZE, VIEW_SIZE):
                 raise ViewError(f"{name} of shape {values.shape}: expected ({VIEW_SIZE}, {VIEW_SIZE}) pixels")
             object.__setattr__(self, name, values)
@@ -73,6 +82,8 @@ class TopDownView:
         Raises:
             ViewError: if the object does not fit into the window.
         """
+        check_type("obj", obj, ObjectModel, ViewError)
+        check_type("action", action, Action, ViewError)
         _check_window(_to_action(obj.corners, action))
         # Only the pixels of the outline's bounding box are asked about.
         first, last = np.sort(_pixels_of(_to_action(obj.corners, action)), axis=0)[[0, -1]]
@@ -107,6 +118,8 @@ class TopDownView:
             ViewError: if the image does not show one whole object, or it does not fit into the window.
         """
         check_scale(metres_per_pixel, ViewError)
+        if not is_number(height) or not 0 < height < np.inf:
+            raise ViewError(f"height is {height!r}: give a positive number of metres")
         try:
             silhouette = read_silhouette(mask)
             action = LeverUp(contact, direction)
@@ -138,6 +151,7 @@ class TopDownView:
         Raises:
             ViewError: if no point of the object lies in the window.
         """
+        points = as_points(points)
         points = points[np.isfinite(points).all(axis=1)]
         pixels = np.rint(_pixels_of(points[:, :2])).astype(int)
         inside = ((pixels >= 0) & (pixels < VIEW_SIZE)).all(axis=1)
@@ -231,6 +245,26 @@ def _to_action(points: Float[np.ndarray, "k 2"], action: Action) -> Float[np.nda
 
 def _to_object(points: Float[np.ndarray, "k 2"], action: Action) -> Float[np.ndarray, "k 2"]:
     return points @ action.T_action_object[:2, :2] + action.contact
+
+
+def _check_scale(scale: object) -> None:
+    if not is_number(scale) or not FINEST <= scale <= COARSEST:  # pyright: ignore[reportOperatorIssue]
+        raise ViewError(f"scale of {scale!r} m per pixel: give a length from {FINEST:g} to {COARSEST:g} m")
+
+
+def as_points(points: object) -> Float[np.ndarray, "k 3"]:
+    """Points as an array.
+
+    Raises:
+        ViewError: They are no numbers in the shape (k, 3).
+    """
+    try:
+        array = np.array(points, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros((0, 0))
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ViewError(f"points of shape {np.shape(points)}: give numbers in the shape (k, 3) [m]")  # pyright: ignore
+    return array
 
 
 def _check_window(outline: Float[np.ndarray, "k 2"]) -> None:

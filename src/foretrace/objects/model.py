@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from foretrace.errors import ShapeError
+from foretrace.errors import ShapeError, is_number
 from foretrace.geometry import convex_hull
 from foretrace.registry import Registry
 
@@ -32,6 +32,8 @@ class Bevel:
     """Height above the table at which the outline is reached [m]."""
 
     def __post_init__(self) -> None:
+        if not (is_number(self.width) and is_number(self.height)):
+            raise ShapeError(f"bevel of {self.width!r} x {self.height!r}: give two numbers of metres")
         if not (np.isfinite([self.width, self.height]).all() and min(self.width, self.height) >= 0):
             raise ShapeError(f"bevel of {self.width} m x {self.height} m: both must be finite and at least 0")
         if (self.width == 0) != (self.height == 0):

@@ -8,7 +8,7 @@ import shapely
 from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 
-from foretrace.errors import ShapeError
+from foretrace.errors import ShapeError, check_type, is_number, is_whole
 from foretrace.geometry import (
     Numbers,
     clip_polygon,
@@ -71,6 +71,9 @@ class Prism(ObjectModel):
 
     def __init__(self, corners: Numbers, height: float = DEFAULT_HEIGHT, bevel: Bevel = BEVEL) -> None:
         object.__setattr__(self, "corners", check_polygon(corners))
+        if not is_number(height):
+            raise ShapeError(f"height is {height!r}: give a number of metres")
+        check_type("bevel", bevel, Bevel, ShapeError)
         object.__setattr__(self, "height", float(height))
         object.__setattr__(self, "bevel", bevel)
         check_size(self.size, self.height)
@@ -285,8 +288,9 @@ def sample_prism(rng: np.random.Generator, num_corners: int) -> Prism:
         ShapeError: if so many corners cannot keep their smallest gap, or fewer than three are asked for.
     """
     most = int(0.5 * 2 * np.pi / SMALLEST_GAP)
-    if not 3 <= num_corners <= most:
-        raise ShapeError(f"sampled polygon with {num_corners} corners: choose 3 to {most}")
+    check_type("rng", rng, np.random.Generator, ShapeError)
+    if not is_whole(num_corners, 3, most):
+        raise ShapeError(f"sampled polygon with {num_corners!r} corners: choose 3 to {most}")
     while True:
         angles = np.sort(rng.uniform(0.0, 2 * np.pi, num_corners))
         gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
@@ -299,6 +303,12 @@ def paper_objects(seed: int = 0, per_corner_count: int = 20) -> list[Prism]:
 
     Each object has its own random stream, so object i can be made again without the others: it is
     ``sample_prism(np.random.default_rng([seed, i]), CORNER_COUNTS[i % len(CORNER_COUNTS)])``.
+
+    Raises:
+        ShapeError: The seed or the count is no whole number from 0 on.
     """
+    for name, value in (("seed", seed), ("per_corner_count", per_corner_count)):
+        if not is_whole(value, 0, 2**63 - 1):
+            raise ShapeError(f"{name} is {value!r}: give a whole number from 0 on")
     counts = CORNER_COUNTS * per_corner_count
     return [sample_prism(np.random.default_rng([seed, i]), count) for i, count in enumerate(counts)]

@@ -56,7 +56,7 @@ def read_silhouette_image(file: Path) -> UInt8[np.ndarray, "rows columns"]:
     Raises:
         ShapeError: The file cannot be read as an image.
     """
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.is_file() else None
     if image is None:
         raise ShapeError(f"cannot read an image from {file}: give a PNG or JPEG, white object on black")
     return image

@@ -43,6 +43,8 @@ def read_silhouette(mask: Shaped[np.ndarray, "rows columns"]) -> Bool[np.ndarray
     Raises:
         ShapeError: if there is no object, more than one, or one that the border cuts off.
     """
+    if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "buif":
+        raise ShapeError(f"mask is a {type(mask).__name__}: give an array of numbers, rows x columns")
     if mask.ndim != 2:
         raise ShapeError(f"mask has shape {mask.shape}: give one channel, rows x columns")
     if mask.size == 0 or not mask.any():

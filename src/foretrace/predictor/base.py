@@ -71,7 +71,11 @@ class EffectPredictor(Imaginer, nn.Module):
         if abstract or not adds_anything(cls):
             return
         own = cls.__dict__.get("config_class")
-        if "label" not in cls.__dict__ or not (isinstance(own, type) and issubclass(own, PredictorConfig)):
+        if (
+            "label" not in cls.__dict__
+            or not (isinstance(own, type) and issubclass(own, PredictorConfig))
+            or own is PredictorConfig
+        ):
             raise TypeError(
                 f"{cls.__name__} needs a label and a config_class of its own, a PredictorConfig; or abstract=True"
             )

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from foretrace.errors import CheckpointError, TrainingError
-from foretrace.files import as_json, atomic_path, read_versioned, write_json
+from foretrace.files import as_json, as_path, atomic_path, make_folder, read_versioned, write_json
 from foretrace.imagined.domain import read_ranges
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.base import PREDICTORS, EffectPredictor
@@ -54,8 +54,8 @@ def save_checkpoint(
         predictor: The predictor.
         training: How it was trained, kept in ``config.json`` for the record.
     """
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
+    directory = as_path(directory, CheckpointError)
+    make_folder(directory, CheckpointError)
     write_tensors(directory / MODEL, predictor.state_dict())
     write_json(directory / CONFIG, describe(predictor) | {"training": dict(training or {})})
 
@@ -83,7 +83,7 @@ def load_predictor(path: str | Path | None = None) -> EffectPredictor:
     Raises:
         CheckpointError: A file is missing or damaged, of another version, or the tensors do not fit.
     """
-    path = default_checkpoint() if path is None else Path(path)
+    path = default_checkpoint() if path is None else as_path(path, CheckpointError)
     config = read_config(path)
     model = path / MODEL
     if not model.is_file():

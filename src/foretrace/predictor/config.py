@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, check_type
 from foretrace.features import FEATURES, FeatureExtractor, Option, make_features
 from foretrace.imagined.context import check_names
 from foretrace.interactions.record import Outcome
@@ -45,11 +45,23 @@ def check_outcomes(outcomes: Any) -> None:
     Raises:
         TrainingError: There is none, or one is unknown.
     """
-    if not outcomes or isinstance(outcomes, str):
+    if not outcomes or not isinstance(outcomes, tuple | list):
         raise TrainingError(f"outcomes is {outcomes!r}: name at least one, of {', '.join(Outcome)}")
     for name in outcomes:
         if name not in list(Outcome):
             raise TrainingError(f"unknown outcome {name!r}; choose from {', '.join(Outcome)}")
+        if list(outcomes).count(name) > 1:
+            raise TrainingError(f"outcome {name!r} is named twice: name it once")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Refuse what is neither True nor False.
+
+    Raises:
+        TrainingError: Naming the setting and its value.
+    """
+    if not isinstance(value, bool):
+        raise TrainingError(f"{name} is {value!r}: give True or False")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +100,7 @@ class TrainConfig:
         if self.outcomes is not None:
             check_outcomes(self.outcomes)
         if self.split is not None:
-            if isinstance(self.split, int | str) or len(self.split) != 3:
+            if not isinstance(self.split, tuple | list) or len(self.split) != 3:
                 raise TrainingError(f"split is {self.split!r}: give the sizes of three parts")
             for size in self.split:
                 check_count("a part of the split", size, 1_000_000_000)
@@ -118,8 +130,10 @@ class PredictorConfig:
     """Conditioning variables beside the view: friction, tool_friction, density; parameters of the action's path."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.context, str):
+        if not isinstance(self.context, tuple | list):
             raise TrainingError(f"context is {self.context!r}: give the names in a tuple")
+        object.__setattr__(self, "context", tuple(self.context))
+        check_type("feature_options", self.feature_options, dict, TrainingError)
         check_names(self.context)
         FEATURES.find(self.features)
 
@@ -129,6 +143,11 @@ class PredictorConfig:
         Args:
             num_samples: Samples of a trajectory.
         """
+        check_count("num_samples", num_samples, 1_000_000, least=2)
+        if not hasattr(self, "predictor_class"):
+            raise TrainingError(
+                f"{type(self).__name__} makes no predictor: take the config of one, as LstmConfig"
+            )
         return self.predictor_class(self, num_samples)
 
     def make_features(self) -> FeatureExtractor:

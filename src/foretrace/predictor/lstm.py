@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from foretrace.features import Precision
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.config import PredictorConfig, check_choice, check_count
+from foretrace.predictor.config import PredictorConfig, check_choice, check_count, check_flag
 from foretrace.predictor.states import STATE_GROUPS, Effects, StateKind, state_size
 
 CHANGE_SCALE = 0.1
@@ -40,6 +40,7 @@ class LstmConfig(PredictorConfig):
         check_count("steps_ahead", self.steps_ahead, 1000)
         check_count("hidden", self.hidden, 4096)
         check_count("window", self.window, 1_000_000)
+        check_flag("residual", self.residual)
 
 
 class ProjectedLstm(nn.Module):

@@ -17,7 +17,14 @@ from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.imagined import LEVELS, Futures, ImaginedBatch, conformal_scores, quantiles_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.predictor.base import EffectPredictor
-from foretrace.predictor.config import PredictorConfig, TrainConfig, check_choice, check_count, check_outcomes
+from foretrace.predictor.config import (
+    PredictorConfig,
+    TrainConfig,
+    check_choice,
+    check_count,
+    check_flag,
+    check_outcomes,
+)
 from foretrace.predictor.ensemble import MANY, Ensemble
 from foretrace.predictor.mixture import COORDINATES, TURN_LENGTH, Mixture, along_edges
 from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
@@ -82,7 +89,9 @@ class OneShotConfig(PredictorConfig):
         for name, most in limits.items():
             check_count(name, getattr(self, name), most)
         check_choice("pivot_edges", self.pivot_edges, (1, 2))
+        check_flag("mirrored", self.mirrored)
         check_outcomes(self.outcomes)
+        object.__setattr__(self, "outcomes", tuple(self.outcomes))
 
 
 class Outputs(NamedTuple):

@@ -1,6 +1,6 @@
 """Parts of the data, ready to learn from."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import torch
@@ -107,7 +107,7 @@ def choose_split(source: Source, training: TrainConfig) -> Split:
         TrainingError: No interaction has one of its outcomes, or the parts are larger than the data.
     """
     outcome, outcomes = outcome_of(source), training.outcomes or ()
-    usable = np.flatnonzero(np.isin(outcome, outcomes) & (_usable_lengths(source) >= 2))
+    usable = np.flatnonzero(np.isin(outcome, outcomes) & (usable_lengths(source) >= 2))
     if len(usable) == 0:
         present = ", ".join(np.unique(outcome).tolist()) or "none"
         raise TrainingError(
@@ -124,9 +124,30 @@ def outcome_of(source: Source) -> np.ndarray:
     return np.array(source.index["outcome"].to_pylist())
 
 
-def _usable_lengths(source: Source) -> Int[np.ndarray, " n"]:
+def usable_lengths(source: Source) -> Int[np.ndarray, " n"]:
     """Samples of each interaction up to where the object slipped."""
     if isinstance(source, InteractionBatch):
         return valid_lengths(source)
     slips = source.index["slip_index"].fill_null(np.iinfo(np.int64).max).to_numpy()
     return np.minimum(source.lengths, slips)
+
+
+def check_split(split: Split, lengths: np.ndarray) -> None:
+    """Refuse rows that the data do not have, and parts from which nothing can be learned."""
+    for name, rows in asdict(split).items():
+        if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "iu" or rows.ndim != 1:
+            raise TrainingError(f"{name} part of the split is {rows!r}: give an array of row numbers")
+        if len(rows) and not (rows.min() >= 0 and rows.max() < len(lengths)):
+            worst = rows.min() if rows.min() < 0 else rows.max()
+            raise TrainingError(
+                f"{name} part of the split has row {worst}: the data have {len(lengths)} rows"
+            )
+        if name == "test":
+            continue
+        if not len(rows):
+            raise TrainingError(f"{name} part of the split is empty: give at least one interaction")
+        if (lengths[rows] < 2).any():
+            row = rows[lengths[rows] < 2][0]
+            raise TrainingError(
+                f"{name} part of the split has row {row} of fewer than two samples before a slip: leave it out"
+            )

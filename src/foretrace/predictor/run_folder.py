@@ -19,6 +19,7 @@ from foretrace.errors import DatasetError, TrainingError
 from foretrace.files import (
     as_json,
     first_difference,
+    make_folder,
     read_json,
     short_hash,
     versions_of,
@@ -113,7 +114,7 @@ class RunFolder:
             return
         if not (self.path / CONFIG).is_file() and self.path.is_dir() and any(self.path.iterdir()):
             raise TrainingError(f"{self.path} is not empty and holds no training: choose another folder")
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path, TrainingError)
         for name in (RESUME, MODEL, METRICS):
             (self.path / name).unlink(missing_ok=True)
         for events in self.path.glob(f"{TENSORBOARD}/events.*"):

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, check_type
 from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
-from foretrace.files import short_hash
+from foretrace.files import as_path, short_hash
 from foretrace.imagined.domain import ranges_of
 from foretrace.interactions.dataset import Dataset, InteractionBatch, count_outcomes
 from foretrace.interactions.record import Outcome
@@ -24,7 +24,7 @@ from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
 from foretrace.predictor.config import PredictorConfig, TrainConfig
 from foretrace.predictor.display import tensorboard, terminal
-from foretrace.predictor.parts import Part, choose_split, outcome_of, prepare
+from foretrace.predictor.parts import Part, check_split, choose_split, outcome_of, prepare, usable_lengths
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, Source, fingerprint
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
 from foretrace.predictor.states import Effects, state_statistics
@@ -119,12 +119,15 @@ def train_predictor(
     if not isinstance(data, Dataset | InteractionBatch):
         raise TrainingError(f"data of type {type(data).__name__}: give a Dataset or an InteractionBatch")
     training = _loop_settings(predictor, training)
+    check_type("data", data, (InteractionBatch, Dataset), TrainingError)
+    check_type("split", split, (Split, type(None)), TrainingError)
     source = data.batch() if isinstance(data, Dataset) and len(data) <= IN_MEMORY else data
-    folder = RunFolder(out)
+    folder = RunFolder(as_path(out, TrainingError))
     threads = training.threads or (folder.threads if resume else None)
     with _made(predictor, training, source, threads) as made:
         training = replace(training, outcomes=training.outcomes or made.outcomes or (str(Outcome.LEVERED),))
         split = choose_split(source, training) if split is None else split
+        check_split(split, usable_lengths(source))
         made.learned_from = _outcomes_of(source, split)
         described = {name: value for name, value in asdict(training).items() if name not in RUNTIME}
         described |= {
@@ -192,7 +195,12 @@ class _Training:
         predictor.set_context(train.context)
         self.effects = self._effects_of(train, in_place=train.large)
         # The loss of a state's small change is small: the usual epsilon of 1e-8 would outweigh its gradient.
-        self.optimizer = torch.optim.AdamW(parameter_groups(predictor), eps=1e-12, fused=True)
+        groups = parameter_groups(predictor)
+        if not groups:
+            raise TrainingError(
+                f"predictor {predictor.label!r} has no parameters to train: create them in __init__"
+            )
+        self.optimizer = torch.optim.AdamW(groups, eps=1e-12, fused=True)
 
     def run(
         self,
@@ -346,13 +354,8 @@ def _outcomes_of(source: Source, split: Split) -> tuple[str, ...]:
 
 
 def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: TrainConfig | None) -> TrainConfig:
-    for name, value, kinds in (
-        ("predictor", predictor, (PredictorConfig, EffectPredictor)),
-        ("training", training, (TrainConfig, type(None))),
-    ):
-        if not isinstance(value, kinds):
-            wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
-            raise TrainingError(f"{name} of type {type(value).__name__}: give {wanted}")
+    check_type("predictor", predictor, (PredictorConfig, EffectPredictor), TrainingError)
+    check_type("training", training, (TrainConfig, type(None)), TrainingError)
     config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
     return config.training if training is None else training
 

@@ -19,8 +19,17 @@ import pyarrow as pa
 from rich.console import Console
 
 from foretrace.actions import Action, LeverUp, Screwdriver, ToolPath
-from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_ranges
-from foretrace.files import LOCK, as_json, first_difference, remove_partial, sole_writer, versions_of
+from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type, is_whole
+from foretrace.files import (
+    LOCK,
+    as_json,
+    as_path,
+    first_difference,
+    make_folder,
+    remove_partial,
+    sole_writer,
+    versions_of,
+)
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import count_outcomes
 from foretrace.interactions.record import Interaction
@@ -66,8 +75,17 @@ class CollectConfig:
     """The screwdriver."""
 
     def __post_init__(self) -> None:
-        limits = {"objects": (1, MOST), "contacts_per_edge": (1, MOST), "seed": (0, np.inf)}
-        check_ranges(SimulationError, "data set", self, limits, "give a whole number in this range")
+        for name, least, most in (
+            ("objects", 1, MOST),
+            ("contacts_per_edge", 1, MOST),
+            ("seed", 0, 2**63 - 1),
+        ):
+            value = getattr(self, name)
+            if not is_whole(value, least, most):
+                raise SimulationError(f"{name} is {value!r}: give a whole number from {least} to {most}")
+        kinds = {"simulation": SimulationConfig, "path": ToolPath, "randomisation": Randomisation}
+        for name, kind in (kinds | {"recipe": str, "tool": Screwdriver}).items():
+            check_type(name, getattr(self, name), kind, SimulationError)
         RECIPES.find(self.recipe)
 
 
@@ -144,7 +162,8 @@ def collect(
         DatasetError: The folder holds something else, or a data set of another configuration.
         SimulationError: A trial could not be simulated at all.
     """
-    out, console = Path(out), console or Console(stderr=True)
+    check_type("config", config, CollectConfig, SimulationError)
+    out, console = as_path(out, DatasetError), console or Console(stderr=True)
     workers = count_workers(workers, SimulationError)
     _prepare_folder(out)
     with sole_writer(out, DatasetError):
@@ -165,7 +184,7 @@ def _prepare_folder(out: Path) -> None:
         strangers = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith(own))
         if strangers:
             raise DatasetError(f"{out} holds {strangers[0]} and is no data set; choose a new folder")
-    (out / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
+    make_folder(out / storage.SHARD_FOLDER, DatasetError)
 
 
 def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[str, Any]:

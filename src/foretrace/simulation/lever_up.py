@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import FAILED, Action, Motion, ToolPath
-from foretrace.errors import ActionError, SimulationError, check_ranges
+from foretrace.errors import ActionError, SimulationError, check_ranges, check_type, is_number, is_whole
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -30,6 +30,9 @@ from foretrace.objects import ObjectModel
 from foretrace.simulation.engine import make_engine
 
 CAMERAS = ("exact", "rgbd")
+LARGEST_SEED = 2**63 - 1
+SHORTEST, LONGEST = 1e-5, 1.0
+"""Limits of time steps and sample periods [s]."""
 PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
 """What is simulated: friction coefficients, densities of anything solid [kg/m^3]."""
 LEVER_ARM = "it is a lever arm in metres, a tenth of a millimetre on a hard table"
@@ -57,6 +60,18 @@ class SimulationConfig:
     """Friction and density."""
 
     def __post_init__(self) -> None:
+        check_type("physics", self.physics, Physics, SimulationError)
+        numbers = {name: getattr(self, name) for name in ("timestep", "sample_period", "watch_time")}
+        for name, value in (numbers | asdict(self.physics)).items():
+            if not is_number(value) and not (name == "table_edge" and value is None):
+                raise SimulationError(f"{name} is {value!r}: give a number")
+        if not SHORTEST <= self.timestep <= self.sample_period <= LONGEST:
+            raise SimulationError(
+                f"timestep = {self.timestep} s and sample_period = {self.sample_period} s: give at least {SHORTEST} s, "
+                f"at most {LONGEST} s, and the time step not longer than the sample period"
+            )
+        for name in ("engine", "embodiment"):
+            check_type(name, getattr(self, name), str, SimulationError)
         check_ranges(SimulationError, "simulation", self, {"watch_time": (0.0, 60.0)}, "give seconds")
         check_ranges(SimulationError, "physics", self.physics, PHYSICS_RANGES, "check its unit")
         check_ranges(SimulationError, "physics", self.physics, {"rolling_friction": (0.0, 0.1)}, LEVER_ARM)
@@ -96,7 +111,12 @@ def simulate_lever_up(
         ViewError: If the object does not fit in the view.
     """
     if not isinstance(action, Action):
-        raise ActionError(f"{type(action).__name__} is no action: give a LeverUp or another Action")
+        raise ActionError(f"action is a {type(action).__name__}: give a LeverUp or another Action")
+    check_type("obj", obj, ObjectModel, SimulationError)
+    check_type("config", config, SimulationConfig, SimulationError)
+    check_type("execution_error", execution_error, ExecutionOffset, SimulationError)
+    if not is_whole(seed, 0, LARGEST_SEED):
+        raise SimulationError(f"seed is {seed!r}: give a whole number from 0 to {LARGEST_SEED}")
     action.check_contact(obj)
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
@@ -171,10 +191,7 @@ def replay(interaction: Interaction) -> Interaction:
     Raises:
         SimulationError: The interaction is a recording of a real one, or its engine is not installed.
     """
-    if not isinstance(interaction, Interaction):
-        raise SimulationError(
-            f"{type(interaction).__name__} is no interaction: give one, such as dataset.with_id(12)"
-        )
+    check_type("interaction", interaction, Interaction, SimulationError)
     made = interaction.provenance
     if made.source != "simulated":
         raise SimulationError(

@@ -1,0 +1,240 @@
+"""Values of another type, size or shape at the doors of the Python interface: one table for each kind of error."""
+
+# pyright: reportArgumentType=false
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import foretrace as ft
+from factories import fake_batch, fake_interaction
+from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError, TrainingError, ViewError
+from foretrace.interactions.dataset import RowError
+from foretrace.interactions.splits import Split
+from foretrace.predictor import EffectPredictor, PredictorConfig
+from foretrace.simulation.collect import CollectConfig, collect
+
+pytestmark = pytest.mark.usefixtures("untyped")
+BOX = ft.Box(0.15, 0.14, 0.02)
+ACTION = ft.LeverUp.at_edge(BOX, 0)
+VIEW = ft.TopDownView.of(BOX, ACTION)
+MASK = np.pad(np.ones((60, 60)), 20)
+PATH = ft.ToolPath()
+LSTM = ft.LstmConfig(features="none", hidden=4)
+LOOP = ft.TrainConfig(epochs=1, min_steps=1, split=None, threads=1)
+
+
+def simulate(obj=BOX, action=ACTION, **settings):
+    return ft.simulate(obj, action, **({"embodiment": "tool"} | settings))
+
+
+def physics(**values):
+    return lambda: simulate(physics=ft.Physics(**values))
+
+
+REFUSED = {
+    ActionError: {
+        "direction [1e+200, 1e+200] is too long": lambda: ft.LeverUp((0, 0), (1e200, 1e200)),
+        "contact [1e+300, 0.0] lies 1e+300 m away": lambda: ft.LeverUp((1e300, 0), (1, 0)),
+        "contact Box(": lambda: ft.LeverUp(BOX, (1, 0)),
+        "edge 1.5 of an object with 4 edges": lambda: ft.LeverUp.at_edge(BOX, 1.5),
+        "edge True of": lambda: ft.LeverUp.at_edge(BOX, True),
+        "fraction 'half' of an edge": lambda: ft.LeverUp.at_edge(BOX, 0, "half"),
+        "obj is a TopDownView: give a ObjectModel": lambda: ft.LeverUp.at_edge(VIEW, 0),
+        "obj is a NoneType": lambda: ft.LeverUp.nearest(None, (0, 0)),
+        "ahead is 'a': give a number": lambda: ACTION.moved("a", 0, 0),
+        "action is a str": lambda: ft.LeverUp.from_dict("lever-up"),
+        "tool is a list": lambda: ft.LeverUp.from_dict(ACTION.to_dict() | {"tool": [1]}),
+        "sweep = True is outside": lambda: ft.ToolPath(sweep=True),
+        "sweep = nan is outside": lambda: ft.ToolPath(sweep=np.nan),
+        "insertion = 'x' is outside": lambda: ft.ToolPath(insertion="x"),
+        "speed = 'fast' times": lambda: PATH.faster("fast"),
+        "speed = nan times": lambda: PATH.faster(np.nan),
+        "action is a str: give a LeverUp": lambda: simulate(action="lever-up"),
+        "lies 625.0 mm from the object's outline": lambda: simulate(action=ft.LeverUp((0.7, 0), (-1, 0))),
+    },
+    ViewError: {
+        "scale of 'x' m per pixel": lambda: ft.TopDownView(VIEW.mask, VIEW.height, "x"),
+        "scale of 1e-09 m": lambda: ft.TopDownView(VIEW.mask, VIEW.height, 1e-9),
+        "scale of True m": lambda: ft.TopDownView(VIEW.mask, VIEW.height, True),
+        "height is 'x': give an array": lambda: ft.TopDownView(VIEW.mask, "x"),
+        "values that are NaN": lambda: ft.TopDownView(np.where(VIEW.mask, 1, np.nan), VIEW.height),
+        "obj is a LeverUp": lambda: ft.TopDownView.of(ACTION, BOX),
+        "action is a str": lambda: ft.TopDownView.of(BOX, "lever-up"),
+        "mask is a str": lambda: ft.TopDownView.from_mask("mask.png", 1e-3, (0, 0.03), (0, -1)),
+        "scale of None m": lambda: ft.TopDownView.from_mask(MASK, None, (0, 0.03), (0, -1)),
+        "height is nan": lambda: ft.TopDownView.from_mask(MASK, 1e-3, (0, 0.03), (0, -1), np.nan),
+        "points of shape (4, 2)": lambda: ft.TopDownView.from_points(np.zeros((4, 2))),
+        "points of shape ()": lambda: ft.TopDownView.from_points("cloud"),
+    },
+    ShapeError: {
+        "height is '2 cm'": lambda: ft.Prism(BOX.corners, "2 cm"),
+        "bevel is a float: give a Bevel": lambda: ft.Prism(BOX.corners, 0.02, 0.003),
+        "bevel of 'x' x 0": lambda: ft.Bevel("x", 0),
+        "seed is -1": lambda: ft.paper_objects(-1),
+        "rng is a int: give a Generator": lambda: ft.sample_prism(0, 5),
+        "polygon with '5' corners": lambda: ft.sample_prism(np.random.default_rng(0), "5"),
+    },
+    SimulationError: {
+        "obj is a str": lambda: simulate(obj="box"),
+        "physics is a dict: give a Physics": lambda: simulate(physics={"friction": 0.5}),
+        "friction is 'x': give a number": physics(friction="x"),
+        "density is [1]: give a number": physics(density=[1]),
+        "friction = nan is outside": physics(friction=np.nan),
+        "timestep is None": lambda: simulate(timestep=None),
+        "timestep = 1e-09 s and": lambda: simulate(timestep=1e-9),
+        "timestep = 0.003 s does not divide 0.05 s": lambda: simulate(timestep=0.003),
+        "engine is a list": lambda: simulate(engine=[]),
+        "seed is -1: give a whole number": lambda: simulate(seed=-1),
+        "config is a dict": lambda: ft.simulate_lever_up(BOX, ACTION, {}),
+        "execution_error is a tuple": lambda: ft.simulate_lever_up(BOX, ACTION, execution_error=(0, 0, 0)),
+        "interaction is a str": lambda: ft.replay("interaction"),
+        "objects is 1.5: give a whole number": lambda: CollectConfig(objects=1.5),
+        "path is a NoneType": lambda: CollectConfig(path=None),
+        "config is a NoneType": lambda: collect(None, "out"),
+        "workers is 'x'": lambda: collect(CollectConfig(objects=8), "out", "x"),
+    },
+    TrainingError: {
+        "outcomes is 3": lambda: ft.TrainConfig(outcomes=3),
+        "unknown outcome 'leverd'": lambda: ft.TrainConfig(outcomes=("leverd",)),
+        "'levered' is named twice": lambda: ft.TrainConfig(outcomes=("levered", "levered")),
+        "split is {1, 2, 3}": lambda: ft.TrainConfig(split={1, 2, 3}),
+        "split is (1, 2)": lambda: ft.TrainConfig(split=(1, 2)),
+        "device is 'gpu'": lambda: ft.TrainConfig(device="gpu"),
+        "precision is 'fp16'": lambda: ft.TrainConfig(precision="fp16"),
+        "learning_rate is inf": lambda: ft.TrainConfig(learning_rate=np.inf),
+        "state is 'poses'": lambda: ft.LstmConfig(state="poses"),
+        "residual is 'no'": lambda: ft.LstmConfig(residual="no"),
+        "mirrored is None": lambda: ft.OneShotConfig(mirrored=None),
+        "context is 3": lambda: ft.LstmConfig(context=3),
+        "feature_options is a list": lambda: ft.LstmConfig(feature_options=[1]),
+        "num_samples is 'x'": lambda: LSTM.make("x"),
+        "PredictorConfig makes no predictor": lambda: PredictorConfig().make(9),
+    },
+    DatasetError: {
+        "None is no path": lambda: ft.Dataset.open(None),
+        "interactions is a Interaction": lambda: ft.InteractionBatch.from_interactions(
+            fake_interaction(np.random.default_rng(0), 0)
+        ),
+        "interaction 0 is a str": lambda: ft.InteractionBatch.from_interactions(["x"]),
+        "views is a TopDownView": lambda: ft.InteractionBatch.from_views(VIEW),
+    },
+}  # fmt: skip
+ROWS = [(error, message) for error, table in REFUSED.items() for message in table]
+
+
+def check(error, message, call):
+    with pytest.raises(error) as caught:
+        call()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("error", "message"), ROWS, ids=[message for _, message in ROWS])
+def test_bad_values_are_refused_in_one_line(error, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    check(error, message, REFUSED[error][message])
+    assert not list(tmp_path.iterdir())
+
+
+def split(**rows):
+    parts = {"train": np.arange(4), "validation": np.arange(4), "test": np.arange(0)}
+    return Split(**(parts | rows))
+
+
+TRAININGS = {
+    "predictor is a TrainConfig": {"predictor": LOOP},
+    "predictor is a str": {"predictor": "lstm"},
+    "training is a dict": {"training": {"epochs": 1}},
+    "data is a str: give a InteractionBatch or Dataset": {"data": "data"},
+    "None is no path": {"out": None},
+    "cannot be made (": {"out": "file/run"},
+    "split is a tuple": {"split": (1, 2, 3)},
+    "train part of the split is empty": {"split": lambda: split(train=np.arange(0))},
+    "train part of the split has row 99: the data have 8 rows": {
+        "split": lambda: split(train=np.array([99]))
+    },
+    "test part of the split has row -1": {"split": lambda: split(test=np.array([-1]))},
+    "validation part of the split is array([0.5])": {"split": lambda: split(validation=np.array([0.5]))},
+}
+
+
+@pytest.mark.parametrize("message", TRAININGS)
+def test_bad_trainings_are_refused_in_one_line(message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    batch = fake_batch(np.random.default_rng(0), 8)
+    given = {"data": batch, "predictor": LSTM, "out": "run", "training": LOOP, "progress": False}
+    given |= {name: value() if callable(value) else value for name, value in TRAININGS[message].items()}
+    check(TrainingError, message, lambda: ft.train_predictor(**given))
+
+
+def test_a_predictor_needs_a_config_of_its_own(registered):
+    with pytest.raises(TypeError, match="needs a label and a config_class of its own"):
+
+        class Borrowed(EffectPredictor):
+            label = "borrowed"
+            config_class = PredictorConfig
+
+    assert not hasattr(PredictorConfig, "predictor_class")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "data"
+    collect(CollectConfig(1, 1, simulation=ft.SimulationConfig(embodiment="tool")), folder, workers=1)
+    return ft.Dataset.open(folder)
+
+
+SELECTIONS = {
+    "1.5 chooses no rows": lambda data: data[1.5],
+    "'x' chooses no rows": lambda data: data["x"],
+    "None chooses no rows": lambda data: data[None],
+    "True chooses no rows": lambda data: data[True],
+    "there is no row 99": lambda data: data[99],
+    "[99] chooses no rows": lambda data: data[[99]],
+    "array([ True, False]) chooses no rows": lambda data: data[np.array([True, False])],
+    "no outcome 'leverd': choose from levered": lambda data: data.where(outcome="leverd"),
+    "no column 'outcom' to filter by: choose from outcome": lambda data: data.where(outcom="levered"),
+    "num_corners is compared with 'x': give a number": lambda data: data.where(num_corners="x"),
+    "num_corners is compared with None": lambda data: data.where(num_corners=None),
+    "the function for num_corners returns": lambda data: data.where(num_corners=lambda n: [True, False]),
+    "size of a batch is 0": lambda data: list(data.batches(0)),
+}
+
+
+@pytest.mark.parametrize("message", SELECTIONS)
+def test_bad_selections_are_refused_in_one_line(message, dataset):
+    check(DatasetError, message, lambda: SELECTIONS[message](dataset))
+
+
+def test_rows_that_are_not_there_end_a_loop_as_ever(dataset):
+    assert issubclass(RowError, IndexError)
+    with pytest.raises(RowError, match="chooses no rows of 3"):
+        dataset.batch()["x"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"shards": {"shards/shard-00000.parquet": None}}, "its entry of shards/shard-00000.parquet is None"),
+        ({"shards": {"shards/shard-00000.parquet": {"sha256": 3}}}, "is damaged"),
+        ({"shard_size": 0}, "its shard_size is 0"),
+        ({"num_trials": -1}, "its num_trials is -1"),
+    ],
+)
+def test_a_damaged_manifest_is_refused_in_one_line(changes, message, dataset, tmp_path):
+    folder = shutil.copytree(dataset.path, tmp_path / "data")
+    manifest = json.loads((folder / "manifest.json").read_text()) | changes
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    check(DatasetError, message, lambda: ft.Dataset.open(folder))
+
+
+def test_an_effect_of_an_object_elsewhere_is_refused():
+    effect = fake_interaction(np.random.default_rng(0), 0).effect
+    moved = replace(effect, com_trajectory=effect.com_trajectory + np.array([0.3, 0.0, 0.0]))
+    with pytest.raises(ft.ForetraceError, match="cm outside the object in the view"):
+        ft.load_predictor().imagine(VIEW, observed=moved)
