@@ -165,8 +165,8 @@ class NonFlat(Experiment):
                 sensitivity[name] = {
                     "probes": len(part),
                     "irreducible_cm": round(float(apart.to_numpy().mean()), 4),
-                    "median_irreducible_cm": round(float(apart.median()), 4),
-                    "same_outcome": round(float(part["same"].astype(float).mean()), 4),
+                    "median_irreducible_cm": round(float(np.median(apart.to_numpy())), 4),
+                    "same_outcome": round(float(part["same"].to_numpy(float).mean()), 4),
                 }
         return {"paper": PAPER, "goal": GOAL, "settings": settings, "outcome_sensitivity": sensitivity}
 

@@ -88,7 +88,7 @@ class Reconstruction(Experiment):
             str(name): {
                 "features": part["features"].iloc[0],
                 "iou_mean": round(float(np.mean(part["iou"].to_numpy(float))), 4),
-                "iou_worst": round(float(part["iou"].min()), 4),
+                "iou_worst": round(float(part["iou"].to_numpy(float).min()), 4),
                 "masks": len(part),
             }
             for name, part in rows.groupby("training", sort=False)

@@ -104,7 +104,7 @@ class ReplayExperiment(Experiment):
                     "frames": len(part),
                     "start_velocity": last["start_velocity"],
                     "mean_position_error_m": float(np.mean(position.to_numpy(float))),
-                    "largest_position_error_m": float(position.max()),
+                    "largest_position_error_m": float(position.to_numpy(float).max()),
                     "final_position_error_m": float(last["position_error_m"]),
                     "mean_rotation_error_deg": float(np.mean(turned.to_numpy(float))),
                     "final_rotation_error_deg": float(last["rotation_error_deg"]),

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from foretrace.evaluation.tables import capitalised, markdown_table, number
@@ -101,7 +102,7 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
                 {"what": what, "below_cm": bar} | {kind: _below(kind, entries, mine, bar) for kind in PAIR}
             )
     note = RECORDED_NOTE if RECORDED in set(rows["group"]) else NOTE
-    about = {"note": note, "repeats": int(rows["repetition"].max()) + 1}
+    about = {"note": note, "repeats": int(rows["repetition"].to_numpy().max()) + 1}
     return {**about, "edges": edges, "objects": objects, "bars": bars, "outcomes": _counts(rows)}
 
 
@@ -128,7 +129,7 @@ def _below(kind: str, entries: Sequence[Mapping[str, Any]], rows: pd.DataFrame, 
     """Whether all means and how many single lever-ups lie below a bar; a mean that is missing does not."""
     means = [entry[kind]["mean"] for entry in entries]
     below = sum(mean is not None and mean < bar for mean in means)
-    share = round(float(rows[DISTANCES[kind]].lt(bar).mean()), 4)
+    share = round(float(np.mean(rows[DISTANCES[kind]].to_numpy(float) < bar)), 4)
     return {
         "holds": below == len(means), "means_below": below, "means": len(means), "share_of_lever_ups": share
     }  # fmt: skip
