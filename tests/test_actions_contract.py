@@ -18,7 +18,8 @@ from foretrace.interactions.doctor import examine
 from foretrace.objects import Cylinder, ObjectModel, Prism
 from foretrace.simulation.collect import CollectConfig
 from foretrace.simulation.engine import ENGINES, Engine, make_engine
-from foretrace.simulation.lever_up import simulate
+from foretrace.simulation.lever_up import SimulationConfig, simulate
+from foretrace.simulation.recipes import RECIPES
 
 SQUARE = Prism([(0.0, 0.0), (0.16, 0.0), (0.16, 0.12), (0.0, 0.12)])
 CYLINDER = Cylinder(0.03, 0.12)
@@ -226,8 +227,12 @@ def test_an_engine_of_ones_own_registers_itself():
 
 
 def test_a_data_set_of_another_action(tmp_path):
-    config = CollectConfig(objects=1, contacts_per_edge=1)
-    counts = collect(config, tmp_path, workers=1, simulate=EXAMPLE_MODULE.push_trial)
+    RECIPES.add("pushes", EXAMPLE_MODULE.Pushes(("prism",)))
+    try:
+        config = CollectConfig(1, 1, 0, SimulationConfig(embodiment="tool"), "pushes")
+        counts = collect(config, tmp_path, workers=1)
+    finally:
+        del RECIPES._entries["pushes"]
     dataset = Dataset.open(tmp_path)
     assert counts == dataset.outcomes() == {"pushed": 3}
     assert examine(tmp_path).findings == ()

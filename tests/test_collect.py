@@ -251,9 +251,7 @@ def test_falls_and_edges_survive_storing(tmp_path):
 
 @pytest.mark.parametrize("recipe", ["Solids", "", "prisms"])
 def test_unknown_recipes_are_refused(recipe):
-    with pytest.raises(
-        SimulationError, match=f"recipe '{recipe}' is unknown: choose one of paper, solids, mixed"
-    ):
+    with pytest.raises(SimulationError, match=f"unknown recipe '{recipe}'; available: paper, solids, mixed"):
         CollectConfig(recipe=recipe)
 
 

@@ -296,7 +296,7 @@ def test_nothing_moves_before_somebody_says_yes(base_file, tmp_path, capsys, mon
         confirm([])
 
     monkeypatch.setattr("builtins.input", answer)
-    monkeypatch.setattr("foretrace.robot.execution.execute", fake_execute)
+    monkeypatch.setattr("foretrace.cli.robot.move", fake_execute)
     options = ["--execute", "--host", "arm", "--speed", "1", "--timeout", "0.3"]
     assert cli.main(command(base_file, tmp_path, *options)) == 2
     assert given == [True, False, False]

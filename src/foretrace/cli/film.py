@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from foretrace.actions import LeverUp
 from foretrace.cli.console import say
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PerceptionError, SimulationError
@@ -57,6 +58,8 @@ def film(
             raise SimulationError(f"--{option} is {value}: give a number from 0 to {most}")
     dataset = Dataset.open(data)
     shown = dataset.with_id(id)
+    if not isinstance(shown.action, LeverUp):
+        raise SimulationError(f"interaction {id} is a {shown.action.label}: only lever-ups can be filmed")
     camera = WEBCAM.scaled(width / WEBCAM.width)
     recorded = dataset.manifest["configuration"].get("simulation", {})
     simulation = SimulationConfig(
