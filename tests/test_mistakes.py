@@ -27,15 +27,15 @@ for call in (
 print(repr(predictor.imagine(view)))
 """
 EXPECTED = """\
-TopDownView is no interaction: give one, such as dataset.with_id(12)
-Box is no action: give a LeverUp or another Action
+interaction of type TopDownView: give Interaction
+action of type Box: give a LeverUp or another Action
 view of type Box: give TopDownView
-actions of type LeverUp: give a list of actions
+actions of type LeverUp: give Iterable
 candidate 1 of type int: give Action
 observed of type TopDownView: give an Effect, or ObservedMotion(times, poses) with\
  poses of the object in the action frame
-data of type str: give a Dataset or an InteractionBatch
-data of type TopDownView: give a Dataset or an InteractionBatch
+data of type str: give InteractionBatch or Dataset
+data of type TopDownView: give InteractionBatch or Dataset
 """
 
 

@@ -292,11 +292,11 @@ NONSENSE = {
     ),
     "context is 0.5: give values by name": lambda p, **more: p.imagine(VIEW, context=0.5),
     "context is 'friction': give values by name": lambda p, **more: p.imagine(VIEW, context="friction"),
-    "view is a ndarray: give a TopDownView": lambda p, **more: p.imagine(VIEW.mask, **more),
-    "action is a str: give a Action": lambda p, **more: p.imagine(VIEW, "lever-up", **more),
-    "actions is a LeverUp: give a Iterable": lambda p, **more: p.imagine_candidates(VIEW, OWN, **more),
-    "candidate 1 is a NoneType": lambda p, **more: p.imagine_candidates(VIEW, [OWN, None], **more),
-    "batch is a TopDownView": lambda p, **more: p.imagine_batch(VIEW),
+    "view of type ndarray: give TopDownView": lambda p, **more: p.imagine(VIEW.mask, **more),
+    "action of type str: give Action": lambda p, **more: p.imagine(VIEW, "lever-up", **more),
+    "actions of type LeverUp: give Iterable": lambda p, **more: p.imagine_candidates(VIEW, OWN, **more),
+    "candidate 1 of type NoneType": lambda p, **more: p.imagine_candidates(VIEW, [OWN, None], **more),
+    "batch of type TopDownView": lambda p, **more: p.imagine_batch(VIEW),
     "the batch is empty": lambda p, **more: p.imagine_batch(InteractionBatch.from_views([])),
     "mask of the batch has the type float64": lambda p, **more: p.imagine_batch(
         replace(InteractionBatch.from_views([VIEW]), mask=VIEW.mask[None] * 1.0)

@@ -106,7 +106,7 @@ def check_type(name: str, value: object, kinds: type | tuple[type, ...], error: 
     if not isinstance(value, kinds):
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
-        raise error(f"{name} is a {type(value).__name__}: give a {wanted}")
+        raise error(f"{name} of type {type(value).__name__}: give {wanted}")
 
 
 def is_number(value: object) -> bool:

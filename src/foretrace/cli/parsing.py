@@ -159,8 +159,13 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
 
 def _in_one_line(told: str, program: str) -> str:
     """What tyro says in a box with a title, a message, and sections about what was meant and where help is."""
-    lines = [line.strip("\u2502\u256d\u256e\u2570\u256f \n") for line in told.splitlines()[1:]]
-    message, *others = "\n".join(lines).split("\n" + "\u2500" * 10)
+    # The box is drawn with dashes where the output knows no other lines.
+    lines = [
+        line.strip("\u2502\u256d\u256e\u2570\u256f \n").replace("\u2500", "-")
+        for line in told.splitlines()[1:]
+    ]
+    parted = re.split(r"^-{10,}.*$", "\n".join(lines), flags=re.MULTILINE)
+    message, *others = [part for part in parted if part.strip()]
     parts = [" ".join(message.split()).rstrip(".")]
     meant = [line.strip() for part in others if "Perhaps you meant" in part for line in part.splitlines()]
     if names := [line for line in meant if line.startswith("-")]:

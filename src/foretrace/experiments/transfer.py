@@ -195,8 +195,9 @@ class Transfer(Experiment):
         if self.prisms is not None:
             subjects += read_prisms(self.prisms, height)
         found = {(str(subject.group), subject.name): subject for subject in subjects}
-        if twice := [each for each in subjects if found[each.group, each.name] is not each]:
-            group, name = twice[0].group, twice[0].name
+        if len(found) < len(subjects):
+            names = [(subject.group, subject.name) for subject in subjects]
+            group, name = next(each for each in names if names.count(each) > 1)
             raise ShapeError(f"two of the {group} are called {name!r}: give every object its own name")
         return found
 

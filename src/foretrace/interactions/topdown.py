@@ -21,8 +21,6 @@ VIEW_SIZE = 128
 """Rows and columns of a view."""
 METRES_PER_PIXEL = 0.0032
 """Side of a pixel [m]."""
-FINEST, COARSEST = 1e-6, 0.1
-"""Sides of the smallest and of the largest pixels of pictures [m]."""
 ROWS_AHEAD = 96
 """Rows of pixels ahead of the contact point; the rest lies behind it."""
 CONTACT_PIXEL = np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5])
@@ -245,11 +243,6 @@ def _to_action(points: Float[np.ndarray, "k 2"], action: Action) -> Float[np.nda
 
 def _to_object(points: Float[np.ndarray, "k 2"], action: Action) -> Float[np.ndarray, "k 2"]:
     return points @ action.T_action_object[:2, :2] + action.contact
-
-
-def _check_scale(scale: object) -> None:
-    if not is_number(scale) or not FINEST <= scale <= COARSEST:  # pyright: ignore[reportOperatorIssue]
-        raise ViewError(f"scale of {scale!r} m per pixel: give a length from {FINEST:g} to {COARSEST:g} m")
 
 
 def as_points(points: object) -> Float[np.ndarray, "k 3"]:

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int, Shaped
 
-from foretrace.errors import ForetraceError, ShapeError
+from foretrace.errors import ForetraceError, ShapeError, is_number
 from foretrace.geometry import cross, mask_outline
 
 SPECK = 0.01
@@ -30,6 +31,8 @@ CORNER_SHARE = 0.2
 """Points at either end of a side that may be left out, as a share of all."""
 LEAST_SINE = 0.17
 """Corners sharper than 20 degrees are put back no further than one of these."""
+FINEST, COARSEST = 1e-6, 0.1
+"""Sides of the smallest and of the largest pixels of images [m]."""
 FIT_ROUNDS = 5
 """Rounds of fitting a line and weighing its points anew."""
 
@@ -44,7 +47,7 @@ def read_silhouette(mask: Shaped[np.ndarray, "rows columns"]) -> Bool[np.ndarray
         ShapeError: if there is no object, more than one, or one that the border cuts off.
     """
     if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "buif":
-        raise ShapeError(f"mask is a {type(mask).__name__}: give an array of numbers, rows x columns")
+        raise ShapeError(f"mask of type {type(mask).__name__}: give an array of numbers, rows x columns")
     if mask.ndim != 2:
         raise ShapeError(f"mask has shape {mask.shape}: give one channel, rows x columns")
     if mask.size == 0 or not mask.any():
@@ -82,10 +85,12 @@ def _check_border(found: Bool[np.ndarray, "rows columns"]) -> None:
             )
 
 
-def check_scale(metres_per_pixel: float, error: type[ForetraceError]) -> None:
-    """Refuse an image's scale [m] that is no positive length, by an error of the given class."""
-    if not (np.isfinite(metres_per_pixel) and metres_per_pixel > 0):
-        raise error(f"scale of {metres_per_pixel} m per pixel: it must be a positive length")
+def check_scale(metres_per_pixel: Any, error: type[ForetraceError]) -> None:
+    """Refuse an image's scale [m] that no image has, by an error of the given class."""
+    if not is_number(metres_per_pixel) or not FINEST <= metres_per_pixel <= COARSEST:
+        raise error(
+            f"scale of {metres_per_pixel!r} m per pixel: give a length from {FINEST:g} to {COARSEST:g} m"
+        )
 
 
 def silhouette_origin(silhouette: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2"]:

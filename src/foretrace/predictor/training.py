@@ -116,8 +116,6 @@ def train_predictor(
         TrainingError: The predictor does not fit the data or was trained before, the split is larger than the data, the
             folder is in use, or the loss is no longer finite.
     """
-    if not isinstance(data, Dataset | InteractionBatch):
-        raise TrainingError(f"data of type {type(data).__name__}: give a Dataset or an InteractionBatch")
     training = _loop_settings(predictor, training)
     check_type("data", data, (InteractionBatch, Dataset), TrainingError)
     check_type("split", split, (Split, type(None)), TrainingError)

@@ -111,7 +111,7 @@ def simulate_lever_up(
         ViewError: If the object does not fit in the view.
     """
     if not isinstance(action, Action):
-        raise ActionError(f"action is a {type(action).__name__}: give a LeverUp or another Action")
+        raise ActionError(f"action of type {type(action).__name__}: give a LeverUp or another Action")
     check_type("obj", obj, ObjectModel, SimulationError)
     check_type("config", config, SimulationConfig, SimulationError)
     check_type("execution_error", execution_error, ExecutionOffset, SimulationError)
