@@ -131,7 +131,8 @@ BAD_MASKS = {
     "touches the top border.*add a black margin": (np.ones((20, 20), dtype=bool), 0.005),
     "scale of 0.0 m per pixel": (square_mask(), 0.0),
     "scale of nan m per pixel": (square_mask(), np.nan),
-    "size 28.*check unit": (square_mask(20), 1.0),
+    "scale of 1.0 m per pixel": (square_mask(20), 1.0),
+    "size 2.*check unit": (square_mask(20), 0.09),
     "size 0.00": (square_mask(20), 0.0001),
 }
 

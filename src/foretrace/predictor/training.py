@@ -116,8 +116,8 @@ def train_predictor(
         TrainingError: The predictor does not fit the data or was trained before, the split is larger than the data, the
             folder is in use, or the loss is no longer finite.
     """
-    training = _loop_settings(predictor, training)
     check_type("data", data, (InteractionBatch, Dataset), TrainingError)
+    training = _loop_settings(predictor, training)
     check_type("split", split, (Split, type(None)), TrainingError)
     source = data.batch() if isinstance(data, Dataset) and len(data) <= IN_MEMORY else data
     folder = RunFolder(as_path(out, TrainingError))
