@@ -323,6 +323,26 @@ def test_damage_is_an_error_of_one_line(file: str, content: str, message: str, t
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rows", None),
+        ("rows", [3]),
+        ("identity", "x"),
+        ("trial", []),
+        ("trial", {"name": "a"}),
+        ("trial", {"seed": "x"}),
+    ],
+)
+def test_a_damaged_trial_is_an_error_of_one_line(name: str, value: Any, tmp_path: Path):
+    run_experiment(Toy((0,)), tmp_path, console=QUIET)
+    (file,) = (tmp_path / TRIALS).glob("*.json")
+    file.write_text(json.dumps(json.loads(file.read_text()) | {name: value}))
+    with pytest.raises(ResultsError, match="is damaged: .*; remove it") as caught:
+        run_experiment(Toy((0,)), tmp_path, console=QUIET)
+    assert "\n" not in str(caught.value)
+
+
 def test_what_cannot_be_run_is_refused(tmp_path: Path):
     with pytest.raises(ResultsError, match="takes long and has to keep its results"):
         run_experiment(EXPERIMENTS["paper"]())

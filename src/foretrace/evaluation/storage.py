@@ -53,8 +53,21 @@ class Store:
             content = read_versioned(
                 file, TRIAL_FORMAT, TRIAL_VERSION, ResultsError, "remove it", key="version"
             )
+            for name, kind in (("identity", dict), ("trial", dict), ("rows", list)):
+                if not isinstance(content.get(name), kind):
+                    raise ResultsError(
+                        f"{file} is damaged: its {name} is {content.get(name)!r:.60}; remove it"
+                    )
+            if odd := [row for row in content["rows"] if not isinstance(row, dict)]:
+                raise ResultsError(f"{file} is damaged: a row is {odd[0]!r:.60}; remove it")
             self._check(content["identity"])
-            found[trial_of(self.experiment.trial, content["trial"])] = content["rows"]
+            try:
+                trial = trial_of(self.experiment.trial, content["trial"])
+            except (KeyError, TypeError, ValueError) as reason:
+                raise ResultsError(
+                    f"{file} is damaged: its trial is none ({reason!r}); remove it"
+                ) from reason
+            found[trial] = content["rows"]
         return found
 
     def save(self, trial: Trial, rows: Iterable[Mapping[str, Any]], seconds: float) -> None:
