@@ -338,7 +338,7 @@ def test_a_damaged_trial_is_an_error_of_one_line(name: str, value: Any, tmp_path
     run_experiment(Toy((0,)), tmp_path, console=QUIET)
     (file,) = (tmp_path / TRIALS).glob("*.json")
     file.write_text(json.dumps(json.loads(file.read_text()) | {name: value}))
-    with pytest.raises(ResultsError, match="is damaged: .*; remove it") as caught:
+    with pytest.raises(ResultsError, match=r"is damaged: .*; remove it") as caught:
         run_experiment(Toy((0,)), tmp_path, console=QUIET)
     assert "\n" not in str(caught.value)
 
