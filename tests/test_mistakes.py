@@ -27,10 +27,10 @@ for call in (
 print(repr(predictor.imagine(view)))
 """
 EXPECTED = """\
-interaction of type TopDownView: give Interaction
+interaction of type TopDownView: give an Interaction, such as dataset.with_id(12)
 action of type Box: give a LeverUp or another Action
 view of type Box: give TopDownView
-actions of type LeverUp: give Iterable
+actions of type LeverUp: give a list of actions
 candidate 1 of type int: give Action
 observed of type TopDownView: give an Effect, or ObservedMotion(times, poses) with\
  poses of the object in the action frame

@@ -294,7 +294,7 @@ NONSENSE = {
     "context is 'friction': give values by name": lambda p, **more: p.imagine(VIEW, context="friction"),
     "view of type ndarray: give TopDownView": lambda p, **more: p.imagine(VIEW.mask, **more),
     "action of type str: give Action": lambda p, **more: p.imagine(VIEW, "lever-up", **more),
-    "actions of type LeverUp: give Iterable": lambda p, **more: p.imagine_candidates(VIEW, OWN, **more),
+    "actions of type LeverUp: give a list of actions": lambda p, **more: p.imagine_candidates(VIEW, OWN, **more),
     "candidate 1 of type NoneType": lambda p, **more: p.imagine_candidates(VIEW, [OWN, None], **more),
     "batch of type TopDownView": lambda p, **more: p.imagine_batch(VIEW),
     "the batch is empty": lambda p, **more: p.imagine_batch(InteractionBatch.from_views([])),

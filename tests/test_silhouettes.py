@@ -45,7 +45,7 @@ def test_image_rows_go_down_and_y_goes_up():
     assert len(prism.corners) == 6
 
 
-# Always the same examples: of thousands, a polygon with a very sharp corner leaves the allowed area (1.7 % for 1.1 %).
+# Always the same examples: the next test has one of another kind.
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(seeds, corner_counts, st.floats(0.0003, 0.001))
 def test_corners_survive_the_way_through_a_mask(seed, num_corners, metres_per_pixel):
@@ -63,6 +63,12 @@ def test_corners_survive_the_way_through_a_mask(seed, num_corners, metres_per_pi
     # The outline may be left by a millimetre; on average, to either side, it is by far less than half of that.
     allowed = 0.0005 * shapely.LinearRing(outline).length
     assert polygon_area(prism.corners) == pytest.approx(polygon_area(outline), abs=allowed)
+
+
+@pytest.mark.xfail(strict=True, reason="the area of this polygon is 1.7 % too small, where 1.1 % are allowed")
+def test_a_polygon_that_does_not_survive_well_enough():
+    case = test_corners_survive_the_way_through_a_mask.hypothesis.inner_test
+    case(seed=9, num_corners=9, metres_per_pixel=0.000795360540794061)
 
 
 def test_tolerance_decides_the_corner_count():

@@ -94,7 +94,13 @@ def check_ranges(
             raise error(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: {remedy}")
 
 
-def check_type(name: str, value: object, kinds: type | tuple[type, ...], error: type[ForetraceError]) -> None:
+def check_type(
+    name: str,
+    value: object,
+    kinds: type | tuple[type, ...],
+    error: type[ForetraceError],
+    wanted: str | None = None,
+) -> None:
     """Refuse a value of another type.
 
     Args:
@@ -102,10 +108,11 @@ def check_type(name: str, value: object, kinds: type | tuple[type, ...], error: 
         value: The value.
         kinds: The types that it may have.
         error: The class to raise.
+        wanted: What to give instead, for the message; by default the names of the types.
     """
     if not isinstance(value, kinds):
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
-        wanted = " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
+        wanted = wanted or " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
         raise error(f"{name} of type {type(value).__name__}: give {wanted}")
 
 

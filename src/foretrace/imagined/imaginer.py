@@ -214,7 +214,7 @@ class Imaginer(ABC):
         self._check_sight()
         check_type("view", view, TopDownView, PredictionError)
         check_object(view.mask, view.height)
-        check_type("actions", actions, Iterable, PredictionError)
+        check_type("actions", actions, Iterable, PredictionError, "a list of actions")
         actions = tuple(actions)
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")

@@ -191,7 +191,13 @@ def replay(interaction: Interaction) -> Interaction:
     Raises:
         SimulationError: The interaction is a recording of a real one, or its engine is not installed.
     """
-    check_type("interaction", interaction, Interaction, SimulationError)
+    check_type(
+        "interaction",
+        interaction,
+        Interaction,
+        SimulationError,
+        "an Interaction, such as dataset.with_id(12)",
+    )
     made = interaction.provenance
     if made.source != "simulated":
         raise SimulationError(
