@@ -38,7 +38,7 @@ def compare_trials(file: Path, every: int = 1) -> list[Comparison]:
         every: Take one of so many.
     """
     config, rows = SimulationConfig(embodiment="tool"), []
-    for shape in json.loads(file.read_text(encoding="utf-8")):
+    for shape in json.loads(file.read_text(encoding="utf-8-sig")):
         corners = np.array(shape["corners"])
         prism = Prism(corners)
         # A clockwise polygon is reordered: find each corner again.

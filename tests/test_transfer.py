@@ -294,11 +294,12 @@ def test_real_silhouettes_and_prisms() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[]", "names no prism"),
+        ("[]", "holds a list where"),
+        ("{}", "names no prism"),
         ('{"a": {}}', "a has no corners_m"),
         ('{"a": {"corners_m": [[0, 0], [1, 1]]}}', "a: polygon with 2 corners"),
         ('{"a": {"corners_m": [[0, 0], [0.1, 0], [0, 0.1]], "mass_kg": -1}}', "mass_kg -1"),
-        ("{", "cannot read prisms"),
+        ("{", "cannot be read as JSON"),
     ],
 )
 def test_bad_prisms_are_named(tmp_path, content, message) -> None:
@@ -415,7 +416,7 @@ def test_more_objects_leave_the_others_as_they_are(run, tmp_path) -> None:
         (["--workers", "0"], "workers is 0"),
         (["--silhouettes", "{tmp}"], "has no silhouettes"),
         (["--silhouettes", "{tmp}/nowhere"], "is no folder"),
-        (["--prisms", "{tmp}/none.json"], "cannot read prisms"),
+        (["--prisms", "{tmp}/none.json"], "none.json does not exist"),
         (["--size", "0"], "--size is 0"),
         (["--height", "inf"], "--height is inf"),
         (["--out", "{tmp}/run/config.json"], "is a file"),

@@ -13,6 +13,8 @@ from typing import Any
 from foretrace.errors import ForetraceError
 
 LOCK = ".lock"
+LARGEST_TEXT = 2**28
+"""Bytes of text that are read; what is longer, or never ends, is no file that foretrace reads."""
 PARTIAL = ".partial"
 """Ending of a file that is being written; what has it is the rest of an interrupted run."""
 
@@ -80,6 +82,41 @@ def write_json(path: Path, content: Any, indent: int = 1) -> None:
     write_text(path, json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
 
 
+def read_text(path: Path, error: type[ForetraceError], remedy: str, fallback: str | None = None) -> str:
+    """The text in a file, as editors and spreadsheets write it; line ends stay as they are.
+
+    It is UTF-8, UTF-16 or UTF-32, with or without a byte order mark.
+
+    Args:
+        path: The file.
+        error: The class to raise.
+        remedy: What to do about a file that cannot be read; ends the message.
+        fallback: Encoding of what is none of these, where a letter read wrongly does no harm.
+
+    Raises:
+        ForetraceError: Of the given class: the file is missing, too large, or no text.
+    """
+    try:
+        with open(path, "rb") as file:
+            content = file.read(LARGEST_TEXT + 1)
+    except FileNotFoundError:
+        raise error(f"{path} does not exist: {remedy}") from None
+    except (OSError, ValueError) as reason:  # a ValueError for a name that no file can have
+        raise error(f"{path} cannot be read ({getattr(reason, 'strerror', reason)}): {remedy}") from reason
+    if len(content) > LARGEST_TEXT:
+        raise error(f"{path} is longer than {LARGEST_TEXT >> 20} MB: {remedy}")
+    encoding = json.detect_encoding(content)
+    try:
+        return content.decode(encoding).removeprefix("\ufeff")
+    except UnicodeDecodeError as reason:
+        if fallback is None or b"\0" in content:
+            raise error(
+                f"{path} is no text in {encoding.removesuffix('-sig').upper()} "
+                f"(byte {content[reason.start]:#04x} at {reason.start}): save it as UTF-8, or {remedy}"
+            ) from reason
+        return content.decode(fallback)
+
+
 def read_json(path: Path, error: type[ForetraceError], remedy: str) -> dict[str, Any]:
     """The object in a JSON file.
 
@@ -89,14 +126,11 @@ def read_json(path: Path, error: type[ForetraceError], remedy: str) -> dict[str,
         remedy: What to do about a file that cannot be read; ends the message.
 
     Raises:
-        ForetraceError: Of the given class: the file is missing, is not UTF-8 or JSON, or holds no object.
+        ForetraceError: Of the given class: the file is missing, is no text or JSON, or holds no object.
     """
+    text = read_text(path, error, remedy)
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise error(f"{path} does not exist: {remedy}") from None
-    except OSError as reason:
-        raise error(f"{path} cannot be read ({reason.strerror}): {remedy}") from reason
+        content = json.loads(text)
     except (ValueError, RecursionError) as reason:
         raise error(f"{path} cannot be read as JSON ({reason}): {remedy}") from reason
     if not isinstance(content, dict):

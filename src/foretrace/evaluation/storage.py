@@ -15,7 +15,7 @@ import pandas as pd
 
 from foretrace.errors import ResultsError
 from foretrace.evaluation.experiment import EXPERIMENTS, Experiment, Plain, Trial, trial_of
-from foretrace.files import as_json, first_difference, read_versioned, write_json, write_text
+from foretrace.files import as_json, first_difference, read_text, read_versioned, write_json, write_text
 
 TRIALS, ROWS, SUMMARY, REPORT = "trials", "rows.csv", "summary.json", "report.md"
 TRIAL_FORMAT, SUMMARY_FORMAT = "foretrace-trial", "foretrace-results"
@@ -194,24 +194,23 @@ def parse_rows(file: Path, kind: type[Trial]) -> dict[Trial, Rows]:
     """
     names = [each.name for each in fields(kind)]
     done: dict[Trial, Rows] = {}
-    with open(file, encoding="utf-8", newline="") as lines:
-        reader = csv.DictReader(lines)
+    text = read_text(file, ResultsError, "restore it, or remove the folder")
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    try:
         head = reader.fieldnames or []
         if missing := [name for name in names if name not in head]:
             raise ResultsError(
                 f"{file} lacks the columns {', '.join(missing)}: restore it, or remove the folder"
             )
-        for number, line in enumerate(reader, 2):
-            try:
-                if None in line or None in line.values():
-                    raise ValueError
-                trial = trial_of(kind, line)
-            except ValueError:
-                raise ResultsError(
-                    f"{file}, line {number} is no row of results: restore the file, or remove that line"
-                ) from None
+        for line in reader:
+            if None in line or None in line.values():
+                raise ValueError
             row = {name: _value(text) for name, text in line.items() if name not in names and text != ""}
-            done.setdefault(trial, []).append(row)
+            done.setdefault(trial_of(kind, line), []).append(row)
+    except (ValueError, csv.Error):
+        raise ResultsError(
+            f"{file}, line {reader.line_num} is no row of results: restore the file, or remove that line"
+        ) from None
     return done
 
 

@@ -6,7 +6,6 @@ The paper prints a pentagon and a heptagon (tables 1 and 2) and takes a book, a 
 Nothing here needs torch: worker processes start with this module.
 """
 
-import json
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import shapely
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, ShapeError
+from foretrace.files import read_json
 from foretrace.geometry import convex_hull, inward_normals
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.objects import Prism, read_silhouette
@@ -168,12 +168,10 @@ def read_prisms(file: Path, height: float = GIVEN_HEIGHT) -> list[Subject]:
     Raises:
         ShapeError: The file is missing or not such a file, or an outline is not usable.
     """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ShapeError(f"cannot read prisms from {file} ({error})") from error
-    if not isinstance(content, dict) or not content:
-        raise ShapeError(f'{file} names no prism: write {{"name": {{"corners_m": [[x, y], ...]}}, ...}}')
+    wanted = 'write {"name": {"corners_m": [[x, y], ...]}, ...}'
+    content = read_json(file, ShapeError, wanted)
+    if not content:
+        raise ShapeError(f"{file} names no prism: {wanted}")
     subjects = []
     for name, values in content.items():
         if not isinstance(values, dict) or "corners_m" not in values:

@@ -1,6 +1,8 @@
 """Recordings to read: a folder of frames with time stamps, a video, or a ROS bag."""
 
 import csv
+import io
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from foretrace.errors import PerceptionError
+from foretrace.files import read_text
 from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import Frame, RecordingNotes, read_depth, read_image
@@ -81,23 +84,45 @@ def open_recording(path: str | Path, topic: str | None = None, depth_topic: str 
 
 
 def _read_times(folder: Path) -> list[tuple[float, str, str]]:
-    path = folder / recording_folder.TIMES
+    """Time [s], image and depth image of each frame; spreadsheets write ``;`` and decimal commas, too."""
+    path, names = folder / recording_folder.TIMES, ", ".join(recording_folder.COLUMNS)
+    text = read_text(path, PerceptionError, f"write a line per frame with {names}")
+    delimiter = max(",;\t", key=text.partition("\n")[0].count)
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        found = [(float(row["time_s"]), row["colour"], row.get("depth") or "") for row in rows]
-    except OSError as error:
+        head = [name.strip().lower() for name in next(lines, [])]
+        if missing := [name for name in ("time_s", "colour") if name not in head]:
+            raise PerceptionError(
+                f"{path} lacks the column {missing[0]} (its first line is {','.join(head)!r:.80}): "
+                f"its columns are {names}"
+            )
+        found = [(lines.line_num, line) for line in lines if any(line)]
+    except csv.Error as error:
         raise PerceptionError(
-            f"{folder} has no {recording_folder.TIMES} ({error.strerror}): write a line per frame with "
-            f"{', '.join(recording_folder.COLUMNS)}"
-        ) from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise PerceptionError(
-            f"{path} cannot be read ({error!r}): its columns are {', '.join(recording_folder.COLUMNS)}"
+            f"{path}, line {lines.line_num} cannot be read ({error}): its columns are {names}"
         ) from error
     if not found:
-        raise PerceptionError(f"{path} lists no frame")
-    return found
+        raise PerceptionError(f"{path} lists no frame: write a line per frame with {names}")
+    return [_time_and_images(f"{path}, line {number}", head, line) for number, line in found]
+
+
+def _time_and_images(place: str, head: list[str], line: list[str]) -> tuple[float, str, str]:
+    if len(line) > len(head):
+        raise PerceptionError(
+            f"{place} has {len(line)} entries, the first line {len(head)}: write times with a point, "
+            "and names with a comma in quotes"
+        )
+    row = dict(zip(head, line, strict=False))
+    stated = row.get("time_s", "").strip()
+    try:
+        time = float(stated.replace(",", "."))
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise PerceptionError(f"{place}: time_s is {stated!r:.80}: give the time in seconds")
+    if not (colour := row.get("colour", "").strip()):
+        raise PerceptionError(f"{place}: colour is empty: name the frame's image")
+    return time, colour, row.get("depth", "").strip()
 
 
 def _folder_frames(folder: Path, rows: list[tuple[float, str, str]]) -> Iterator[Frame]:
