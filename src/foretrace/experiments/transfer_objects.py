@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 import shapely
 
@@ -23,6 +22,7 @@ from foretrace.interactions.record import Interaction, Physics
 from foretrace.objects import Prism, read_silhouette
 from foretrace.objects.everyday import EVERYDAY, HEPTAGON, PENTAGON
 from foretrace.objects.model import fitting_bevel
+from foretrace.objects.shape_files import read_silhouette_image
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.stand_in import Observation, StandIn
 
@@ -150,9 +150,7 @@ def read_silhouettes(
         )
     subjects = []
     for file in files:
-        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if mask is None:
-            raise ShapeError(f"cannot read a picture from {file}: give a PNG or JPEG, white object on black")
+        mask = read_silhouette_image(file)
         try:
             metres = size / (np.ptp(np.argwhere(read_silhouette(mask)), axis=0).max() + 1)
             obj = Prism.from_mask(mask, metres if scale is None else scale, height)

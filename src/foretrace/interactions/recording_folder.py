@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from foretrace import images
 from foretrace.errors import PerceptionError
 from foretrace.files import read_json, write_json
 
@@ -75,15 +76,12 @@ class RecordingNotes:
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """An image as blue, green and red.
+    """An image as blue, green and red, its pixels as the sensor gave them.
 
     Raises:
         PerceptionError: It is missing or cannot be read.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
-    if image is None:
-        raise PerceptionError(f"cannot read an image from {path}: give a whole PNG or JPEG file")
-    return image
+    return images.read_colour(path, PerceptionError)
 
 
 def read_depth(path: Path) -> Float[np.ndarray, "rows columns"]:
@@ -103,10 +101,11 @@ def read_depth(path: Path) -> Float[np.ndarray, "rows columns"]:
         except (OSError, ValueError, TypeError) as error:
             raise PerceptionError(f"cannot read a depth image from {path} ({error}): {remedy}") from error
     else:
-        steps = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if steps is None or steps.dtype != np.uint16:
-            found = "no image" if steps is None else f"an image of {steps.dtype}"
-            raise PerceptionError(f"cannot read a depth image from {path}, which holds {found}: {remedy}")
+        steps = images.read_image(path, PerceptionError, remedy=remedy).values
+        if steps.dtype != np.uint16:
+            raise PerceptionError(
+                f"cannot read a depth image from {path}, which holds an image of {steps.dtype}: {remedy}"
+            )
         metres = steps * RecordingNotes.load(path.parent).depth_unit
     if metres.ndim != 2:
         raise PerceptionError(

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 
 from foretrace.errors import ShapeError
 from foretrace.files import read_json
+from foretrace.images import read_image
 from foretrace.objects import MeshObject, ObjectModel, Prism, object_from_dict
 from foretrace.objects.prism import DEFAULT_HEIGHT
 
@@ -56,7 +57,4 @@ def read_silhouette_image(file: Path) -> UInt8[np.ndarray, "rows columns"]:
     Raises:
         ShapeError: The file cannot be read as an image.
     """
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.is_file() else None
-    if image is None:
-        raise ShapeError(f"cannot read an image from {file}: give a PNG or JPEG, white object on black")
-    return image
+    return cv2.cvtColor(read_image(file, ShapeError, upright=True).bgr(file, ShapeError), cv2.COLOR_BGR2GRAY)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foretrace.errors import PerceptionError
+from foretrace.images import decode_image
 
 TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
@@ -44,7 +45,8 @@ def read_colour(message: Any, path: Path) -> UInt8[np.ndarray, "rows columns 3"]
         PerceptionError: It is damaged or of an unknown kind.
     """
     if not hasattr(message, "encoding"):
-        return _decode(bytes(message.data), cv2.IMREAD_COLOR, message, path)
+        source = f"compressed image ({message.format}) in bag {path}"
+        return decode_image(bytes(message.data), source, PerceptionError).bgr(source, PerceptionError)
     image = _raw(message, COLOURS, path)
     code = TO_BGR.get(message.encoding)
     return image if code is None else cv2.cvtColor(image, code)
@@ -82,7 +84,7 @@ def _compressed_depth(message: Any, path: Path) -> Float[np.ndarray, "rows colum
             )
         _, a, b = HEADER.unpack_from(data)
         data = data[HEADER.size :]
-    steps = _decode(data, cv2.IMREAD_UNCHANGED, message, path)
+    steps = decode_image(data, f"depth image ({message.format}) in bag {path}", PerceptionError).values
     if steps.dtype != np.uint16 or steps.ndim != 2:
         raise PerceptionError(
             f"bag {path} has depth of {steps.dtype} in {message.format!r}: 16UC1 and 32FC1 can be read"
@@ -91,15 +93,6 @@ def _compressed_depth(message: Any, path: Path) -> Float[np.ndarray, "rows colum
         return steps.astype(float) * MILLIMETRE
     with np.errstate(divide="ignore"):
         return np.where(steps > 0, a / (steps.astype(float) - b), 0.0)
-
-
-def _decode(data: bytes, flags: int, message: Any, path: Path) -> Any:
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
-    if image is None:
-        raise PerceptionError(
-            f"bag {path} holds a compressed image ({message.format}) that cannot be decoded"
-        )
-    return image
 
 
 def _raw(message: Any, known: dict[str, tuple[str, int]], path: Path) -> Any:
