@@ -190,9 +190,20 @@ def test_a_start_far_away_is_refused():
             '{"format": "foretrace-base-pose", "version": 1, "T_table_base": [0, 0, 0, 1, 1, 0, 0]}',
             "unit quaternion",
         ),
-        (
-            '{"format": "foretrace-base-pose", "version": 1, "T_table_base": [0, 0, "x", 1, 0, 0, 0]}',
-            "unit quaternion",
+        *(
+            (f'{{"format": "foretrace-base-pose", "version": 1, "T_table_base": {pose}}}', "unit quaternion")
+            for pose in (
+                '[0, 0, "x", 1, 0, 0, 0]',
+                '["0", "0", "0", "1", "0", "0", "0"]',
+                "[0, 0, true, 1, 0, 0, 0]",
+                "[0, 0, NaN, 1, 0, 0, 0]",
+                "[0, 0, 1e400, 1, 0, 0, 0]",
+                "[-850, 0, 0, 1, 0, 0, 0]",
+                "[0, 0, 0, 1e200, 1e200, 0, 0]",
+                "[[0, 0, 0, 1, 0, 0, 0]]",
+                "{}",
+                "7",
+            )
         ),
     ],
 )
@@ -207,10 +218,16 @@ def test_a_base_pose_is_read(base_file):
     np.testing.assert_allclose(read_base_pose(base_file), T_TABLE_BASE, atol=1e-12)
 
 
-@pytest.mark.parametrize("speed", [0.0, -0.1, 1.1, np.nan])
+@pytest.mark.parametrize("speed", [0.0, -0.1, 1.1, np.nan, 1e-12])
 def test_a_wrong_speed_is_refused(kinematics, speed):
-    with pytest.raises(RobotError, match="choose more than 0 and at most 1"):
+    with pytest.raises(RobotError, match=r"choose 0\.01 to 1"):
         plan_lever_up(kinematics, ACTION, T_TABLE_BASE, speed)
+
+
+def test_a_path_without_end_is_refused(kinematics):
+    slow = LeverUp((0.1, 0.2), (0.6, 0.8), ToolPath(lift_time=60.0))
+    with pytest.raises(RobotError, match="takes 6325 s, more than 600 s: choose a higher speed"):
+        plan_lever_up(kinematics, slow, T_TABLE_BASE, 0.01)
 
 
 def test_wrong_watch_settings_are_refused():
@@ -228,6 +245,13 @@ def test_faults_are_named():
     assert replace(good, safety_mode=3, protective_stop=True).fault == "protective stop"
     assert replace(good, safety_mode=7, emergency_stop=True).fault == "emergency stop"
     refuse_unready(replace(good, playing=False), "arm")
+    for joints, scaling, said in (
+        (np.full(6, np.nan), 1.0, "where no arm can be"),
+        (np.full(6, 1e200), 1.0, "where no arm can be"),
+        (GOOD, np.nan, "scales speeds to nan %"),
+    ):
+        with pytest.raises(RobotError, match=said):
+            refuse_unready(replace(good, playing=False, joints=joints, speed_scaling=scaling), "arm")
     with pytest.raises(RobotError, match="arm is in protective stop: release it"):
         refuse_unready(replace(good, protective_stop=True), "arm")
     with pytest.raises(RobotError, match="arm runs a program: stop it"):
@@ -276,6 +300,44 @@ def test_a_refused_path_opens_no_connection(base_file, tmp_path, capsys):
     assert len(captured.err.splitlines()) == 1
 
 
+def test_a_correction_moves_the_path(kinematics, legs, base_file, tmp_path):
+    options = ["--speed", "1", "--no-retreat", "--correction", "0.001", "-0.002", "0.003"]
+    assert cli.main(command(base_file, tmp_path, *options)) == 0
+    path = np.genfromtxt(tmp_path / "path.csv", delimiter=",", skip_header=1, usecols=range(2, 8))
+    with_it, without = (T_TABLE_BASE @ kinematics.at(q).T_base_tip for q in (path[0], legs[0].joints[0]))
+    np.testing.assert_allclose((with_it - without)[:3, 3], [-0.001, 0.002, -0.003], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--correction", "0", "0", "1.2"], "--correction 0.0 0.0 1.2: give metres, at most 0.01"),
+        (["--correction", "nan", "0", "0"], "--correction nan 0.0 0.0: give metres"),
+        (["--direction", "1e200", "1e200"], "direction [1e+200, 1e+200] is too long"),
+        (["--direction", "1e-320", "0"], "direction [1e-320, 0.0] has no length"),
+        (["--direction", "nan", "1"], "direction [nan, 1.0]: expected two finite numbers"),
+        (["--contact", "1e308", "1e308"], "contact [1e+308, 1e+308] lies 1e+308 m away"),
+        (["--contact", "inf", "0"], "contact [inf, 0.0]: expected two finite numbers"),
+        (["--speed", "nan"], "speed nan: choose 0.01 to 1"),
+        (["--speed", "1e-12"], "speed 1e-12: choose 0.01 to 1"),
+        (["--lift-time", "inf"], "tool path: lift_time = inf is outside 0.05 to 60"),
+        (["--timeout", "1e400"], "watch: timeout = inf is outside 0.05 to 2"),
+        (["--height-error", "0"], "watch: height_error = 0.0 is outside 0.0001 to 0.005"),
+        (["--host", "192.168.1.10:30004"], "has a port: leave it out"),
+        (["--host", "http://192.168.1.10"], "is no name or address of a controller"),
+        (["--host", ""], "host '' is no name or address of a controller"),
+        (["--host", "x" * 5000], "is no name or address of a controller"),
+        (["--base", "nowhere.json"], "nowhere.json does not exist: give a JSON file with T_table_base"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(base_file, tmp_path, capsys, options, said):
+    assert cli.main(command(base_file, tmp_path, *options)) == 2
+    captured = capsys.readouterr()
+    assert said in captured.err
+    assert len(captured.err.splitlines()) == 1
+    assert len(captured.err) < 300
+
+
 def test_executing_needs_a_host(base_file, tmp_path, capsys):
     assert cli.main(command(base_file, tmp_path, "--execute")) == 2
     assert "--execute needs --host" in capsys.readouterr().err
@@ -289,7 +351,8 @@ def test_nothing_moves_before_somebody_says_yes(base_file, tmp_path, capsys, mon
             return reply
         raise reply
 
-    def fake_execute(host, legs, kinematics, T_table_base, out, limits, watch, confirm, film):
+    def fake_execute(host, legs, kinematics, T_table_base, out, limits, watch, confirm, film, **more):
+        assert more == {"correction": (0.0, 0.0, 0.0), "is_ur10": False}
         assert (host, out, film, watch.timeout) == ("arm", tmp_path / "recording.csv", None, 0.3)
         assert [leg.name for leg in legs] == ["descent", "lever-up", "set-down", "retreat"]
         given.extend(confirm([]) for _ in range(3))

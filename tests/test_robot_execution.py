@@ -1,6 +1,8 @@
 """Motions through ur_rtde over real sockets, on the tests' own controller: nothing here has met a real arm."""
 
 import csv
+import signal
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -14,12 +16,13 @@ from foretrace.actions import Screwdriver
 from foretrace.errors import RobotError
 from foretrace.interactions.recording_folder import RecordingNotes
 from foretrace.robot.checks import ArmLimits
+from foretrace.robot.deviation import OTHER_ARM
 from foretrace.robot.execution import SETTLE, MotionLog, WatchConfig, execute
 from foretrace.robot.kinematics import ArmKinematics
-from foretrace.robot.path import ArmPath
+from foretrace.robot.path import ArmPath, plan_approach
 from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD
-from ur_controller import RunningController
+from ur_controller import UR10, UR10E, RunningController, tool_pose
 
 pytest.importorskip("rtde_control", reason="needs ur_rtde: pip install 'foretrace[ur]'")
 if sys.platform != "linux":
@@ -56,8 +59,9 @@ def go(
     film=None,
     watch=PATIENT,
     legs=(LEG,),
+    **more,
 ) -> None:
-    execute(host, legs, kinematics, np.eye(4), recording, ArmLimits(), watch, confirm, film)
+    execute(host, legs, kinematics, np.eye(4), recording, ArmLimits(), watch, confirm, film, **more)
 
 
 def read(recording: Path) -> list[dict[str, str]]:
@@ -189,12 +193,125 @@ def test_what_goes_wrong_half_way_stops_the_arm(kinematics, recording, event, sa
     assert rows[-1]["leg"] == "lever-up"  # no way back after a stop
 
 
-def test_ctrl_c_stops_the_arm_and_keeps_the_recording(kinematics, recording):
-    with RunningController(START, HALF, "interrupt") as controller, pytest.raises(KeyboardInterrupt):
+@pytest.mark.parametrize("names", ["SIGINT", "SIGINT SIGINT SIGINT", "SIGHUP", "SIGQUIT SIGINT", "SIGTERM"])
+def test_signals_stop_the_arm_and_keep_the_recording(kinematics, recording, names):
+    with RunningController(START, HALF, names) as controller, pytest.raises(KeyboardInterrupt) as stop:
         go(controller.host, kinematics, recording)
+    number, where = stop.value.args
+    assert number == signal.Signals[names.split()[0]]
+    assert where.startswith("lever-up, sample ")
+    assert where.endswith("; stopped")
     assert controller.facts.stops == ["servo", "program"]
     assert HALF <= len(controller.facts.set_points) < NUM
     assert len(read(recording)) >= HALF
+
+
+CLOSED_TERMINAL = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_robot import *
+base, out = Path({folder!r}) / "base.json", Path({folder!r}) / "out"
+pose = matrix_to_pose(T_TABLE_BASE).tolist()
+base.write_text(json.dumps({{"format": "foretrace-base-pose", "version": 1, "T_table_base": pose}}))
+start = plan_lever_up(ArmKinematics(Screwdriver()), ACTION, T_TABLE_BASE, 1.0)[0].joints[0]
+with RunningController(start, 40, "SIGHUP SIGHUP") as controller:
+    options = ["--execute", "--yes", "--speed", "1", "--host", controller.host, "--timeout", "1.5"]
+    status = cli.main(command(base, out, *options))
+assert controller.facts.stops == ["servo", "program"], controller.facts.stops
+sys.exit(status)
+"""
+
+
+def test_a_closed_terminal_stops_the_arm(tmp_path):
+    program = CLOSED_TERMINAL.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGHUP, done.stderr
+    assert "interrupted; descent, sample" in done.stderr
+    assert "stopped, " in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("model", "version", "said"),
+    [
+        ("UR10", "URSoftware 5.11.1.108318 (Apr 27 2021)", r"moves a UR10e \(PolyScope 5\.11\.1\.108318\)"),
+        ("UR5", "URSoftware 3.15.8.106339 (Mar 06 2022)", r"moves a UR5 \(PolyScope 3\.15"),
+        ("UR3", "3.14.3", r"moves a UR3 "),
+        ("UR16", "URSoftware 5.9.1.1031110", "moves a UR16e "),
+        ("UR20", "URSoftware 5.15.0.1", "moves a UR20 "),
+        ("", "URSoftware 5.4.2.76197", "moves another arm"),
+        ("", "3.0.15547 (Jun 26 2014)", r"does not say its model.*could not understand.*give --is-ur10"),
+        ("UR10", "who knows", "does not say its version, but 'who knows'"),
+    ],
+)
+def test_another_arm_is_refused_by_name(kinematics, recording, model, version, said):
+    other = RunningController(START, model=model, version=version)
+    with other as controller, pytest.raises(RobotError, match=said):
+        go(controller.host, kinematics, recording)
+    assert (controller.facts.uploads, controller.facts.set_points) == (0, [])
+
+
+def test_an_arm_that_a_user_vouches_for_is_moved(kinematics, recording):
+    with RunningController(START, model="", version="3.0.15547 (Jun 26 2014)") as controller:
+        go(controller.host, kinematics, recording, legs=(STEP,), is_ur10=True)
+    np.testing.assert_allclose(controller.facts.joints, STEP.joints[-1], atol=1e-4)
+
+
+TCP = [0.01, -0.02, 0.15, 0.3, -1.0, 2.0]
+CALIBRATED = {
+    "a": [2e-4, -0.6131, -0.5718, 5e-5, -4e-5, 0.0],
+    "d": [0.1283, 1e-3, -8e-4, 0.1636, 0.1159, 0.0922],
+}
+"""A UR10 as it might leave the factory."""
+
+
+def test_a_flange_that_is_elsewhere_is_refused_before_anything_moves(kinematics, recording):
+    arm = RunningController(START, dh=UR10E, tcp=TCP)
+    with (
+        arm as controller,
+        pytest.raises(RobotError, match=r"flange \d\d\.\d mm and 0\.0 degrees from where a UR10"),
+    ):
+        go(controller.host, kinematics, recording)
+    assert controller.facts.set_points == []
+    assert controller.facts.stops == ["servo", "program"]
+
+
+def test_a_calibrated_arm_needs_its_correction(kinematics, recording, tmp_path):
+    arm = RunningController(START, dh=CALIBRATED, tcp=TCP)
+    with (
+        arm as controller,
+        pytest.raises(RobotError, match="the planned height, more than") as error,
+    ):
+        go(controller.host, kinematics, recording, legs=(STEP,))
+    approach = plan_approach(START, START)
+    assert len(controller.facts.set_points) == len(approach.joints)  # and nothing of the leg after it
+    correction = [float(word) for word in str(error.value).split("--correction ")[1].split()]
+    moved = np.eye(4)
+    moved[:3, 3] = correction
+    with RunningController(START, dh=CALIBRATED, tcp=TCP) as controller:
+        again = tmp_path / "again.csv"
+        limits = ArmLimits()
+        execute(
+            controller.host,
+            (STEP,),
+            kinematics,
+            moved,
+            again,
+            limits,
+            PATIENT,
+            lambda checks: True,
+            correction=correction,
+        )
+    np.testing.assert_allclose(controller.facts.joints, STEP.joints[-1], atol=1e-4)
+
+
+def test_no_ur10_with_other_dimensions_passes(kinematics):
+    """A UR10e's flange is farther from a UR10's than any calibration is, wherever the arm may be."""
+    rng = np.random.default_rng(0)
+    for joints in rng.uniform(-np.pi, np.pi, (500, 6)):
+        own = tool_pose(list(joints), UR10, [0.0] * 6)
+        np.testing.assert_allclose(own[:3], kinematics.at(joints).flange, atol=1e-9)
+        other = tool_pose(list(joints), UR10E, [0.0] * 6)
+        assert np.linalg.norm(np.subtract(other[:3], own[:3])) > 0.024 > 2 * OTHER_ARM
 
 
 def test_an_arm_that_is_not_ready_is_left_alone(kinematics, recording):

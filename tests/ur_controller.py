@@ -21,13 +21,19 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 PERIOD = 0.008
 PROTOCOL, VERSION, OUTPUTS, INPUTS, START, PAUSE, DATA = (bytes([c]) for c in b"VvOISPU")
-SERVO, SERVO_STOP, SET_WATCHDOG, STOP_SCRIPT = 11, 16, 35, 255
+SERVO, SERVO_STOP, SET_WATCHDOG, GET_TCP_OFFSET, STOP_SCRIPT = 11, 16, 35, 40, 255
 READY, DONE = 1, 2
 STOPPED, PLAYING = 1, 2
 FORMATS = {"DOUBLE": "d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I"}
+UR10 = {"a": [0.0, -0.612, -0.5723, 0.0, 0.0, 0.0], "d": [0.1273, 0.0, 0.0, 0.163941, 0.1157, 0.0922]}
+UR10E = {"a": [0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0], "d": [0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655]}
+"""Published Denavit-Hartenberg parameters [m]; the twists are the same for every UR."""
+TWISTS = [math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0]
 SAFETY_BITS = {1: 0b1, 3: 0b100, 7: 0b10000000}
 _hosts = itertools.count(2)
 
@@ -50,12 +56,12 @@ class RunningController:
         joints: Where the arm stands [rad].
         after: Number of set points after which ``event`` happens.
         event: ``protective``, ``emergency`` (stops), ``reduced`` (mode), ``freeze`` (data stop coming), ``drop`` (all
-            connections close, none is accepted), ``stuck`` (the arm stays where it is), ``interrupt`` (Ctrl-C for the
-            process that started this), ``none``.
+            connections close, none is accepted), ``stuck`` (the arm stays where it is), ``none``, or the names of
+            signals for the process that started this: ``SIGINT``, ``SIGINT SIGINT``.
         settings: Other attributes of `Controller` to start with.
     """
 
-    def __init__(self, joints: Any, after: int = 0, event: str = "none", **settings: float) -> None:
+    def __init__(self, joints: Any, after: int = 0, event: str = "none", **settings: Any) -> None:
         # 127.0.0.0/8 is loopback as a whole; the process number keeps tests that run side by side apart.
         self.host = f"127.{os.getpid() // 250 % 250 + 1}.{os.getpid() % 250 + 1}.{next(_hosts)}"
         start = {"host": self.host, "joints": list(joints), "after": after, "event": event, **settings}
@@ -92,11 +98,14 @@ class Client:
 class Controller:
     """The controller's side."""
 
-    def __init__(self, host: str, joints: list[float], after: int, event: str, **settings: float) -> None:
+    def __init__(self, host: str, joints: list[float], after: int, event: str, **settings: Any) -> None:
         self.host, self.joints, self.target = host, joints, joints
         self.after, self.event = after, event
         self.robot_mode, self.safety_mode, self.speed_slider, self.lag = 7, 1, 1.0, 0.02
         self.playing = self.servoing = self.frozen = self.stuck = self.busy = False
+        self.version, self.model = "URSoftware 3.15.8.106339 (Mar 06 2022)", "UR10"
+        self.dh, self.tcp = UR10, [0.0] * 6
+        self.signalled = os.getppid()
         vars(self).update(settings)
         self.facts = Facts()
         self.registers: dict[str, float] = {}
@@ -165,8 +174,8 @@ class Controller:
     def _dashboard(self, client: Client, command: str) -> None:
         if command == "stop":
             self._halt("dashboard")
-        answers = {"PolyscopeVersion": "URSoftware 3.15.8.106339", "stop": "Stopped"}
-        client.socket.sendall((answers.get(command, "could not understand") + "\n").encode())
+        answers = {"PolyscopeVersion": self.version, "get robot model": self.model, "stop": "Stopped"}
+        client.socket.sendall((answers.get(command) or f"could not understand: '{command}'").encode() + b"\n")
 
     def _answer(self, client: Client, kind: bytes, payload: bytes) -> None:
         if kind == PROTOCOL:
@@ -210,6 +219,8 @@ class Controller:
                 self.facts.stops.append("servo")
             elif command == SET_WATCHDOG:
                 self.watchdog = 1 / self.registers["input_double_register_0"]
+            elif command == GET_TCP_OFFSET:
+                self.registers |= {f"output_double_register_{i}": value for i, value in enumerate(self.tcp)}
             self.busy = True
             self.registers["output_int_register_0"] = DONE
 
@@ -223,8 +234,10 @@ class Controller:
             for each in [*self.listeners.values(), *(client.socket for client in self.clients)]:
                 each.close()
             self.listeners, self.clients = {}, []
-        elif self.event == "interrupt":
-            os.kill(os.getppid(), signal.SIGINT)
+        elif self.event.startswith("SIG"):
+            for name in self.event.split():
+                os.kill(self.signalled, getattr(signal, name))
+                time.sleep(0.02)
         else:
             self.frozen, self.stuck = self.event == "freeze", self.event == "stuck"
 
@@ -245,6 +258,7 @@ class Controller:
             "timestamp": time.monotonic(),
             "actual_q": self.joints,
             "target_q": self.target,
+            "actual_TCP_pose": tool_pose(self.joints, self.dh, self.tcp),
             "robot_mode": self.robot_mode,
             "safety_mode": self.safety_mode,
             "safety_status_bits": SAFETY_BITS.get(self.safety_mode, 0),
@@ -273,6 +287,29 @@ def variable_type(name: str) -> str:
     if name in ("runtime_state", "robot_status_bits", "safety_status_bits"):
         return "UINT32"
     return "VECTOR6D"
+
+
+def tool_pose(joints: list[float], dh: dict[str, list[float]], tcp: list[float]) -> list[float]:
+    """Tool centre point in the base frame: position [m], rotation vector [rad]."""
+    pose = np.eye(4)
+    for q, a, d, twist in zip(joints, dh["a"], dh["d"], TWISTS, strict=True):
+        c, s, ct, st = math.cos(q), math.sin(q), math.cos(twist), math.sin(twist)
+        pose = pose @ [[c, -s * ct, s * st, a * c], [s, c * ct, -c * st, a * s], [0, st, ct, d], [0, 0, 0, 1]]
+    x, y, z = angle = np.array(tcp[3:])
+    if turn := float(np.linalg.norm(angle)):
+        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / turn
+        offset = np.eye(4)
+        offset[:3, :3] += math.sin(turn) * k + (1 - math.cos(turn)) * k @ k
+    else:
+        offset = np.eye(4)
+    offset[:3, 3] = tcp[:3]
+    pose = pose @ offset
+    # The axis of a turn is the eigenvector that it leaves alone; its sign by one entry beside the diagonal.
+    values, vectors = np.linalg.eig(pose[:3, :3])
+    axis = np.real(vectors[:, np.abs(values - 1).argmin()])
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = math.atan2(-np.trace(k @ pose[:3, :3]) / 2, (np.trace(pose[:3, :3]) - 1) / 2)
+    return [*pose[:3, 3], *(turn * axis)]
 
 
 if __name__ == "__main__":

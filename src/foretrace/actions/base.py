@@ -23,6 +23,8 @@ CONTACT_TOLERANCE = 0.005
 """A contact may lie this far from the outline, as when it was measured with an error [m]."""
 FARTHEST = 100.0
 """A contact with a larger coordinate is a mistake, such as one in other units [m]."""
+SHORTEST, LONGEST = 1e-9, 1e9
+"""Bounds of a given direction's length, which does not matter otherwise."""
 UNIT_TOLERANCE = 1e-9
 """A stored direction differs from unit length by less than this."""
 
@@ -71,9 +73,9 @@ class Action(ABC):
     def __post_init__(self) -> None:
         contact = plane_vector("contact", self.contact)
         direction = plane_vector("direction", self.direction)
-        length = np.linalg.norm(direction)
-        if not 1e-9 <= length < np.inf:
-            wrong = "has no length" if length < 1e-9 else "is too long"
+        longest = np.abs(direction).max()  # within bounds before it is squared
+        if longest > LONGEST or (length := np.linalg.norm(direction)) < SHORTEST:
+            wrong = "is too long" if longest > LONGEST else "has no length"
             raise ActionError(f"direction {direction.tolist()} {wrong}: give a unit vector into the object")
         if (far := np.abs(contact).max()) > FARTHEST:
             raise ActionError(
@@ -194,8 +196,10 @@ class Action(ABC):
     def moved(self: Placed, ahead: float, left: float, turn: float) -> Placed:
         """The action shifted along its direction and to its left [m], then turned to the left [rad]."""
         for name, value in (("ahead", ahead), ("left", left), ("turn", turn)):
-            if not is_number(value):
-                raise ActionError(f"{name} is {value!r}: give a number of metres or radians")
+            if not is_number(value) or not abs(value) <= FARTHEST:
+                raise ActionError(
+                    f"{name} is {value!r}: give a number of metres or radians, up to {FARTHEST:g}"
+                )
         x, y = self.direction
         contact = self.contact + ahead * np.array([x, y]) + left * np.array([-y, x])
         c, s = np.cos(turn), np.sin(turn)
@@ -231,7 +235,9 @@ class Action(ABC):
         try:
             path = _kinds(kind)["path"](**content["path"])
             action = kind(content["contact"], content["direction"], path, Tool.from_dict(content["tool"]))
-            direction = np.array(content["direction"], dtype=float)
+            direction = np.array(
+                content["direction"], dtype=float
+            )  # finite, and of a length, or refused above
         except (KeyError, TypeError, ValueError) as reason:
             raise ActionError(
                 f"action {kind.label!r} cannot be read ({reason!r}): write it with to_dict"

@@ -55,8 +55,8 @@ COMMANDS: dict[str, Entry] = {
 """Every command by its name, in the order of the help."""
 
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, and after a request of the system to end."""
+KILLED = 128
+"""Exit status after a signal that asks to end, less the signal's number: 130 after Ctrl-C, as a shell says."""
 OUTPUT_CLOSED = 141
 """Exit status where whoever read the output has closed it, as `head` does: what a shell says of SIGPIPE."""
 
@@ -65,11 +65,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
     0: done. 1: `data` has something left to mend, or a trial of `evaluate` failed. 2: an error, printed as
-    one line. 130: interrupted. 141: the output was closed.
+    one line. 128 and the number of a signal that asked to end: 130 after Ctrl-C, 143 after `kill`, 129 after a closed
+    terminal. 141: the output was closed.
     """
     if threading.current_thread() is threading.main_thread():
-        # `kill` and batch systems are obeyed as Ctrl-C is: workers end, too, and what is done is kept.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        # `kill`, batch systems and a closed terminal are obeyed as Ctrl-C is: workers end, and what is done is kept.
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets it
+                signal.signal(number, _interrupt)
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else arguments)
@@ -115,16 +119,25 @@ def _run(arguments: Sequence[str]) -> int:
             return _refuse(f"{where}{error.strerror or error}: check path, permissions and free space")
         except ForetraceError as error:
             return _refuse(str(error))
-        except KeyboardInterrupt:
-            return INTERRUPTED
+        except KeyboardInterrupt as interrupt:
+            return _status_of(interrupt)
         except ImportError as error:
             cause: BaseException | None = error
             while cause is not None:
                 if isinstance(cause, KeyboardInterrupt):  # while a compiled module was loaded
-                    return INTERRUPTED
+                    return _status_of(cause)
                 cause = cause.__cause__ or cause.__context__
             raise
     return status or 0
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt(number)
+
+
+def _status_of(interrupt: KeyboardInterrupt) -> int:
+    """Exit status after a signal, whose number is the first argument unless it was Ctrl-C."""
+    return KILLED + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
 def _refuse(reason: str) -> int:

@@ -17,6 +17,8 @@ from foretrace.errors import RobotError
 from foretrace.files import write_json
 from foretrace.geometry import matrix_to_pose
 from foretrace.robot.checks import ArmLimits, Check, check_path, refuse_unsafe
+from foretrace.robot.dashboard import check_host
+from foretrace.robot.deviation import OTHER_ARM
 from foretrace.robot.execution import WatchConfig
 from foretrace.robot.execution import execute as move
 from foretrace.robot.kinematics import ArmKinematics
@@ -38,6 +40,8 @@ def robot(
     host: str | None = None,
     yes: bool = False,
     camera: str | None = None,
+    correction: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    is_ur10: bool = False,
 ) -> None:
     """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm (experimental).
 
@@ -60,11 +64,24 @@ def robot(
         host: Name or address of the controller; needed with --execute.
         yes: Do not ask before the arm moves.
         camera: Film the motion into the folder's film: number of a camera, or what else OpenCV opens.
+        correction: Deviation of the blade's tip by the arm's own calibration, X Y Z in the table frame [m], as the
+            command tells it before the blade goes down.
+        is_ur10: The arm is a UR10 (CB3); for a controller before PolyScope 3.12, which cannot say so.
     """
     if execute and host is None:
         raise RobotError("--execute needs --host, the controller's address")
+    recording = out / "recording.csv"
+    if execute and recording.exists():
+        raise RobotError(f"{recording} is there already: choose another folder")
+    if host is not None:
+        check_host(host)
+    if not all(abs(value) <= OTHER_ARM for value in correction):
+        raise RobotError(
+            f"--correction {' '.join(map(str, correction))}: give metres, at most {OTHER_ARM:g}, as this command tells"
+        )
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
+    T_table_base[:3, 3] += correction
     legs = plan_lever_up(kinematics, LeverUp(contact, direction, path), T_table_base, speed)
     legs += plan_retreat(legs) if retreat else []
     postures = [kinematics.along(leg.joints) for leg in legs]
@@ -87,17 +104,18 @@ def robot(
         return yes or _agreed(host, sum(len(leg.joints) for leg in legs))
 
     say("this has never moved a real arm: keep the emergency stop in hand; Ctrl-C stops the arm, too")
-    recording = out / "recording.csv"
     try:
         video = None if camera is None else VideoRecorder(camera, out / "film")
-        move(host, legs, kinematics, T_table_base, recording, limits, watch, confirm, video)
-    except KeyboardInterrupt:
-        done = (
-            f"the arm was told to stop, {recording} has what was done"
-            if recording.exists()
-            else "nothing moved"
+        move(
+            *(host, legs, kinematics, T_table_base, recording, limits, watch, confirm, video),
+            correction=correction,
+            is_ur10=is_ur10,
         )
-        say(f"interrupted; {done}")
+    except KeyboardInterrupt as interrupt:
+        stop = (
+            f"{interrupt.args[1]}, {recording} has what was done" if interrupt.args[1:] else "nothing moved"
+        )
+        say(f"interrupted; {stop}")
         raise
     print(recording)
 

@@ -22,11 +22,14 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from foretrace.errors import RobotError
+from foretrace.geometry import invert_transform, rigid_transform
+from foretrace.robot.dashboard import DASHBOARD_PORT, check_host, dashboard, refuse_other_model
 from foretrace.simulation.arm import CONTROL_PERIOD
 
-RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
+RTDE_PORT, SCRIPT_PORT = 30004, 30003
 PATIENCE = 2.0
 """How long an answer may take where the arm does not wait for it [s]."""
 STOP_PATIENCE = 0.5
@@ -122,20 +125,24 @@ class UrController:
     Args:
         host: Name or address of the controller.
         timeout: Longest silence [s], from the controller towards us and from us towards the controller.
+        is_ur10: Whether the arm is known to be a UR10 (CB3), where its controller is too old to name its model.
 
     Raises:
-        RobotError: If ur_rtde is not installed or the controller does not answer.
+        RobotError: If ur_rtde is not installed, the controller does not answer, or its arm is no UR10 (CB3).
     """
 
-    def __init__(self, host: str, timeout: float) -> None:
+    def __init__(self, host: str, timeout: float, is_ur10: bool = False) -> None:
+        check_host(host)
         try:
             from rtde_receive import RTDEReceiveInterface
         except ImportError as error:
             raise RobotError("ur_rtde is not installed: run pip install 'foretrace[ur]'") from error
         self.host, self.timeout = host, timeout
         _greet(host)
+        refuse_other_model(host, is_ur10)
         self._receive = _connect(host, lambda: RTDEReceiveInterface(host, 1 / CONTROL_PERIOD, VARIABLES))
         self._control: Any = None
+        self._T_flange_tool: np.ndarray | None = None
         self._heard, self._timestamp = time.monotonic(), -np.inf
 
     def state(self) -> ArmState:
@@ -186,6 +193,18 @@ class UrController:
             raise RobotError(
                 f"{self.host} did not take the watchdog of {self.timeout:g} s: the arm was not moved"
             )
+        offset = _within(PATIENCE, self._control.getTCPOffset)
+        if offset is None or len(offset) != 6 or not np.isfinite(offset).all():
+            raise RobotError(
+                f"{self.host} does not tell the tool centre point that is set in it: the arm was not moved; look at "
+                "the pendant's log"
+            )
+        self._T_flange_tool = _transform(np.array(offset))
+
+    def flange(self, state: ArmState) -> Float[np.ndarray, "4 4"]:
+        """Flange in the base frame by the controller's own, calibrated kinematics; control must have been taken."""
+        assert self._T_flange_tool is not None
+        return _transform(state.tool_pose) @ invert_transform(self._T_flange_tool)
 
     def send(self, joints: Float[np.ndarray, "6"]) -> bool:
         """Give the next set point [rad], and wait until the one after it is due; False if the connection broke."""
@@ -226,14 +245,8 @@ class UrController:
 
     def _stop_by_dashboard(self) -> bool:
         """Ask the dashboard server, over a connection of its own."""
-        with (
-            contextlib.suppress(OSError),
-            socket.create_connection((self.host, DASHBOARD_PORT), STOP_PATIENCE) as dashboard,
-        ):
-            dashboard.settimeout(STOP_PATIENCE)
-            dashboard.recv(1024)
-            dashboard.sendall(b"stop\n")
-            return dashboard.recv(1024).startswith(b"Stopped")
+        with contextlib.suppress(OSError), dashboard(self.host, STOP_PATIENCE) as ask:
+            return ask("stop").startswith("Stopped")
         return False
 
 
@@ -251,10 +264,8 @@ def _greet(host: str) -> None:
             if rtde.recv(1024) != struct.pack(">HcB", 4, b"V", 1):
                 raise OSError("it does not speak RTDE version 2")
         port = DASHBOARD_PORT
-        with socket.create_connection((host, port), PATIENCE) as dashboard:
-            dashboard.settimeout(PATIENCE)
-            if not dashboard.recv(1024):
-                raise OSError("it hung up")
+        with dashboard(host, PATIENCE):
+            pass
         port = SCRIPT_PORT
         socket.create_connection((host, port), PATIENCE).close()
     except OSError as error:
@@ -279,14 +290,20 @@ def _connect(host: str, make: Callable[[], Any]) -> Any:
     return interface
 
 
-def _within(seconds: float, action: Callable[[], bool]) -> bool:
-    """Whether an action that may hang succeeds within a time [s]; it goes on in the background if not."""
+def _within(seconds: float, action: Callable[[], Any]) -> Any:
+    """What an action that may hang returns within a time [s]; None if it fails, or goes on in the background."""
+    answers: list[Any] = []
     done = threading.Event()
 
     def act() -> None:
         with contextlib.suppress(RuntimeError):
-            if action():
-                done.set()
+            answers.append(action())
+            done.set()
 
     threading.Thread(target=act, daemon=True).start()
-    return done.wait(seconds)
+    return answers[0] if done.wait(seconds) else None
+
+
+def _transform(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    """A pose as the controller writes it: position [m], rotation vector [rad]."""
+    return rigid_transform(Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3])

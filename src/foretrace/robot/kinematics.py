@@ -46,6 +46,8 @@ class ArmKinematics:
     def __init__(self, tool: Screwdriver) -> None:
         self._model = build_scene(None, Physics(), tool, "arm", 0.002).compile()
         self._data = mujoco.MjData(self._model)
+        self.T_flange_tip = arm.T_flange_tip(tool)
+        """Blade tip in the flange's frame."""
         model, capsule = self._model, mujoco.mjtGeom.mjGEOM_CAPSULE
         fixed = [model.body(name).id for name in FIXED_BODIES]
         moving = [g for g in range(model.ngeom) if model.geom_bodyid[g] not in fixed]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from foretrace.actions import LeverUp, tool_transforms
-from foretrace.errors import RobotError
+from foretrace.errors import RobotError, is_number
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, pose_to_matrix
 from foretrace.robot.kinematics import ArmKinematics
@@ -23,6 +23,10 @@ DESCENT_TIME = 2.0
 """Time of the descent, unscaled [s]."""
 APPROACH_SPEED, APPROACH_ACCELERATION = 0.2, 0.5
 """Largest joint speed [rad/s] and acceleration [rad/s^2] on the way to the descent, whatever the scaling."""
+SLOWEST, LONGEST = 0.01, 600.0
+"""Least share of the tool path's own speed, and longest time of descent and lever-up [s]."""
+FARTHEST_BASE = 10.0
+"""An arm's base farther than this from the table's origin is a mistake, such as one in other units [m]."""
 LEVER_UP = "lever-up"
 """Name of the leg that is the tool path."""
 FILE_FORMAT, FILE_VERSION = "foretrace-base-pose", 1
@@ -51,15 +55,20 @@ def read_base_pose(file: Path) -> Float[np.ndarray, "4 4"]:
     """
     remedy = "give a JSON file with T_table_base"
     content = read_versioned(file, FILE_FORMAT, FILE_VERSION, RobotError, remedy, key="version")
-    try:
-        pose = np.array(content.get("T_table_base"), dtype=float)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape != (7,) or not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > 1e-3:
-        raise RobotError(
-            f"{file}: T_table_base = {content.get('T_table_base')}: expected x y z [m] and a unit quaternion w x y z"
-        )
-    return pose_to_matrix(pose)
+    given = content.get("T_table_base")
+    # Within bounds before anything is squared.
+    if (
+        isinstance(given, list)
+        and len(given) == 7
+        and all(is_number(value) and abs(value) <= FARTHEST_BASE for value in given)
+    ):
+        pose = np.array(given, dtype=float)
+        if abs(np.linalg.norm(pose[3:]) - 1) <= 1e-3:
+            return pose_to_matrix(pose)
+    raise RobotError(
+        f"{file}: T_table_base = {str(given)[:80]}: expected x y z [m], at most {FARTHEST_BASE:g} m away, and a unit "
+        "quaternion w x y z"
+    )
 
 
 def plan_lever_up(
@@ -81,8 +90,13 @@ def plan_lever_up(
         RobotError: If the speed is out of range.
         ActionError: If the arm cannot reach a pose.
     """
-    if not 0 < speed <= 1:
-        raise RobotError(f"speed {speed}: choose more than 0 and at most 1, the tool path's own speed")
+    if not is_number(speed) or not SLOWEST <= speed <= 1:
+        raise RobotError(f"speed {speed}: choose {SLOWEST:g} to 1, the tool path's own speed")
+    if (duration := (action.duration + DESCENT_TIME) / speed) > LONGEST:
+        raise RobotError(
+            f"the way to the end of the path takes {duration:.0f} s, more than {LONGEST:g} s: choose a higher speed or "
+            "shorter times"
+        )
     T_base_action = invert_transform(T_table_base) @ invert_transform(action.T_action_object)
     lever = tool_transforms(action.tool_motion(_knots(action.duration)))
     descent = np.repeat(lever[:1], len(_knots(DESCENT_TIME)), axis=0)
