@@ -18,10 +18,14 @@ def calibrate(
     images: Positional[tuple[Path, ...]] = (),
     out: Path = Path("camera.json"),
     print_board: Path | None = None,
+    print_markers: Path | None = None,
+    family: str = "apriltag_36h11",
+    ids: tuple[int, ...] = (0, 1, 2, 3, 10),
+    side: float = 0.05,
     refine: Path | None = None,
     markers: Path | None = None,
 ) -> None:
-    """Calibrate a camera from images of a ChArUco board, or write the board for printing.
+    """Calibrate a camera from images of a ChArUco board, or write the board or markers for printing.
 
     With --refine, a camera file that does not quite fit its images is adjusted by markers of known size instead.
 
@@ -30,16 +34,25 @@ def calibrate(
         images: Images or folders of images: 10 to 20 of the board, slanted, near and far, also in the corners.
         out: File for the camera.
         print_board: Write the board to this .png or .pdf file instead.
+        print_markers: Write markers to this .pdf, .svg or .png file instead: those of --markers, or of --ids.
+        family: Dictionary of the markers that are written.
+        ids: Their numbers.
+        side: Side of their black squares [m].
         refine: Camera file whose focal lengths and first radial distortion are adjusted to the images.
-        markers: Marker layout, of which the table's markers are in the images, seen from several sides.
+        markers: Marker layout; for --refine, its table's markers are in the images, seen from several sides.
     """
     if print_board is not None:
         board.save(print_board)
         width, height = (1000 * length for length in board.size)
         print(f"{print_board}: print at 100 %, the board then measures {width:.1f} x {height:.1f} mm")
         return
+    if print_markers is not None:
+        _print_markers(print_markers, markers, family, dict.fromkeys(ids, side))
+        return
     if not images:
-        raise PerceptionError("no images are given: name images of the board, or --print-board FILE")
+        raise PerceptionError(
+            "no images are given: name images of the board, --print-board FILE or --print-markers FILE"
+        )
     if (refine is None) != (markers is None):
         raise PerceptionError("--refine CAMERA and --markers LAYOUT go together: give both, or neither")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -58,6 +71,21 @@ def calibrate(
     )
     print(f"error {found.error:.3f} pixels over {len(found.errors)} images")
     print(out)
+
+
+def _print_markers(out: Path, layout: Path | None, family: str, sides: dict[int, float]) -> None:
+    """Write the markers of a layout, or of a family."""
+    from foretrace.perception.printing import print_markers
+
+    if layout is not None:
+        known = MarkerLayout.load(layout)
+        family, sides = known.dictionary, {**known.table.sides, **known.object.sides}
+    pages = print_markers(out, family, sides)
+    lengths = ", ".join(f"{1000 * side:.1f}" for side in sorted(set(sides.values())))
+    print(
+        f"{out}: {len(sides)} markers of {family} on {pages} page{'s' * (pages > 1)}; print at 100 %, their black "
+        f"squares then measure {lengths} mm"
+    )
 
 
 def _refine(images: tuple[Path, ...], stated: Path, markers: Path, out: Path) -> None:

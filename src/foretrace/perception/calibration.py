@@ -11,9 +11,10 @@ from jaxtyping import Float, UInt8
 
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform
+from foretrace.interactions.marker_patterns import dictionary
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
-from foretrace.perception.markers import Detections, MarkerBody, dictionary, grey, image_fault, to_transform
+from foretrace.perception.markers import Detections, MarkerBody, grey, image_fault, to_transform
 
 FEWEST_IMAGES = 5
 """Least number of images that show the board."""
@@ -27,8 +28,8 @@ FARTHEST_FOCUS = 0.2
 """Largest relative change of a refined focal length."""
 LEAST_TILT = np.deg2rad(10.0)
 """Least slant of the board in one of the images; without it the focal length stays unknown [rad]."""
-PAPER = 0.02
-"""White margin round a printed board [m]."""
+PAPER = 0.015
+"""White margin round a printed board [m]; with it, the default board fits A4."""
 INCH = 0.0254
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Endings of image files."""

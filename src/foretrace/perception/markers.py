@@ -1,7 +1,8 @@
 """Square markers: which are in an image, and where a body that carries them is.
 
-A marker's frame has its origin in the marker's middle, x to the right and y up as one reads it, z out of it. A flat
-square has two poses that look nearly alike from afar; both are kept, for only time can tell them apart.
+A marker's frame has its origin in the marker's middle, x to the right and y up as one reads it, z out of it (see
+`marker_patterns`). A flat square has two poses that look nearly alike from afar; both are kept, for only time can tell
+them apart.
 """
 
 from collections.abc import Collection, Mapping
@@ -17,23 +18,11 @@ from jaxtyping import Float, Int, Shaped, UInt8
 from foretrace.errors import PerceptionError
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, planar_transform, rigid_transform, transform_points
+from foretrace.interactions.marker_patterns import DICTIONARIES, dictionary
 from foretrace.interactions.pinhole import PinholeCamera
 
 FORMAT = "foretrace-markers"
 VERSION = 1
-DICTIONARIES: dict[str, int] = {
-    **{
-        f"{bits}x{bits}_{count}": getattr(cv2.aruco, f"DICT_{bits}X{bits}_{count}")
-        for bits in (4, 5, 6, 7)
-        for count in (50, 100, 250, 1000)
-    },
-    "aruco_original": cv2.aruco.DICT_ARUCO_ORIGINAL,
-    "apriltag_16h5": cv2.aruco.DICT_APRILTAG_16h5,
-    "apriltag_25h9": cv2.aruco.DICT_APRILTAG_25h9,
-    "apriltag_36h10": cv2.aruco.DICT_APRILTAG_36h10,
-    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
-}
-"""OpenCV's dictionaries by the names that users give."""
 DARK = 25
 """An image whose brightest hundredth is below this grey value is dark (of 255)."""
 BLURRED = 15.0
@@ -70,19 +59,6 @@ class Detections:
         """The corners of one marker, or None where it was not seen, or seen twice."""
         found = np.flatnonzero(self.ids == id)
         return self.corners[found[0]] if len(found) == 1 else None
-
-
-def dictionary(name: str) -> cv2.aruco.Dictionary:
-    """A dictionary of markers.
-
-    Raises:
-        PerceptionError: There is none of that name.
-    """
-    if name.lower() not in DICTIONARIES:
-        raise PerceptionError(
-            f"marker dictionary {name!r} is unknown: choose one of {', '.join(DICTIONARIES)}"
-        )
-    return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name.lower()])
 
 
 @lru_cache(maxsize=32)
@@ -243,6 +219,12 @@ class MarkerBody:
     def ids(self) -> list[int]:
         """The markers' numbers."""
         return list(self.sides)
+
+    def turned(self) -> "MarkerBody":
+        """The body with each marker turned upside down where it is."""
+        return MarkerBody(
+            self.sides, {id: T @ np.diag([-1.0, -1.0, 1.0, 1.0]) for id, T in self.placements.items()}
+        )
 
     def corners(self, id: int) -> Float[np.ndarray, "4 3"]:
         """The corners of one marker in the body frame [m], in the order of `Detections`."""

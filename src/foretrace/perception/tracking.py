@@ -317,12 +317,19 @@ def still_pose(
         np.median([corners for seen in detections if (corners := seen.of(id)) is not None], axis=0)
         for id in often
     ]
-    poses = body.poses(Detections(np.array(often, dtype=int), np.array(places).reshape(-1, 4, 2)), camera)
+    middle = Detections(np.array(often, dtype=int), np.array(places).reshape(-1, 4, 2))
+    poses = body.poses(middle, camera)
     if not poses or poses[0].error > config.largest_error:
         state = f"explained to {poses[0].error:.1f} pixels only" if poses else "not seen"
-        raise PerceptionError(
-            f"markers {body.ids} on the table are {state}: check their layout, sides, dictionary and light"
-        )
+        remedy = "check their layout, sides, dictionary and light"
+        upside_down = body.turned().poses(middle, camera)
+        if len(often) > 1 and upside_down and upside_down[0].error < config.largest_error:
+            state = "not where the layout has them"
+            remedy = (
+                "they fit if each is turned by 180 degrees, as OpenCV draws AprilTags: "
+                'add "angle_deg": 180 to each in the layout'
+            )
+        raise PerceptionError(f"markers {body.ids} on the table are {state}: {remedy}")
     return poses[0].T_camera_body
 
 

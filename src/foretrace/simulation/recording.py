@@ -23,6 +23,7 @@ from foretrace.geometry import (
     transform_points,
 )
 from foretrace.interactions import recording_folder
+from foretrace.interactions.marker_patterns import draw_marker
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.recording_folder import Frame, RecordingNotes, write_recording
@@ -280,9 +281,7 @@ def marker_spot(
 
 def marker_image(id: int) -> UInt8[np.ndarray, "rows columns"]:
     """A marker with its white margin."""
-    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    inner = cv2.aruco.generateImageMarker(markers, id, MODULES * IMAGE_PIXELS, borderBits=1)
-    return np.pad(inner, IMAGE_PIXELS, constant_values=255)
+    return np.pad(draw_marker(DICTIONARY, id, IMAGE_PIXELS), IMAGE_PIXELS, constant_values=255)
 
 
 def _add_markers(
