@@ -102,6 +102,21 @@ def test_sliding_never_gains_energy(engine: str) -> None:
     assert kinetic[-1] < 0.02 * kinetic[0]
 
 
+@pytest.mark.parametrize("timestep", [0.001, 0.002])
+def test_mujoco_returns_every_share_of_the_speed(timestep: float) -> None:
+    cube, returned = Body.box([0.1, 0.1, 0.1], 0.3), []
+    wanted = np.array([0, 0.05, 0.1, 0.13, 0.2, 0.3, 0.5, 0.8])
+    for restitution in wanted:
+        surface = ContactParameters(0.4, restitution=float(restitution))
+        start = [0, 0, 0.25, 1, 0, 0, 0]
+        motion = simulate_free_motion(cube, start, 0.3, contact_parameters=surface, timestep=timestep)
+        speed = motion.velocities[:, 2]
+        returned.append(speed[speed.argmin() :].max() / -speed.min())
+    np.testing.assert_allclose(returned, wanted, atol=0.04)
+    assert np.all(np.diff(returned) > 0)
+    assert returned[0] < 0.02
+
+
 @every_engine
 def test_equal_arguments_give_equal_motions(engine: str) -> None:
     velocity = [1.0, 0.2, 0.0, 0.5, 0.0, 3.0]

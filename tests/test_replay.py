@@ -108,6 +108,29 @@ def test_velocities_are_estimated_from_the_first_frames(tmp_path: Path) -> None:
     assert np.isfinite(estimate_velocity(two)).all()
 
 
+@pytest.mark.parametrize("height", [0.08, 0.1, 0.5])
+@pytest.mark.parametrize("uneven", [False, True])
+def test_velocities_come_from_before_the_first_contact(height: float, uneven: bool, tmp_path: Path) -> None:
+    """Dropped from low enough, the box meets the table within the frames that are looked at, and turns over."""
+    times, velocity = np.arange(60) / 148, np.array([0.4, -0.2, -0.6, 1.0, 5.0, -2.0])
+    gravity = (1.5, 0.0, -9.7) if uneven else (0.0, 0.0, -9.81)
+    surface = ContactParameters(0.4, restitution=0.1, gravity=gravity)
+    start = [0, 0, height, 0.8, 0, 0.6, 0]
+    motion = simulate_free_motion(
+        Body.box(BOX["size"], 0.3), start, 0.5, velocity=velocity, contact_parameters=surface, timestep=0.0005
+    )
+    found = one(
+        tmp_path,
+        times=times.tolist(),
+        poses=motion.at(times).poses.tolist(),
+        restitution=0.1,
+        linear_velocity=None,
+        angular_velocity=None,
+        gravity=gravity,
+    )
+    np.testing.assert_allclose(estimate_velocity(found), velocity, rtol=0.02, atol=0.02)
+
+
 @pytest.mark.parametrize("kind", ["prism", "hull", "mesh"])
 def test_every_geometry_weighs_and_stands_as_a_box(kind: str, tmp_path: Path) -> None:
     corners = np.array([[-0.05, -0.04], [0.05, -0.04], [0.05, 0.04], [-0.05, 0.04]])

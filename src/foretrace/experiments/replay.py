@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from tyro.conf import Positional
 
@@ -28,6 +29,8 @@ FACE_TOLERANCE = np.deg2rad(20.0)
 """The same side is down if its direction differs by less than this [rad]."""
 ESTIMATE_TIME = 0.1
 """Velocities that are not recorded are estimated from the frames of this time [s], from at least three."""
+CLEARANCE = 0.002
+"""An object that a tracker sees at least so far above the table touches nothing [m]."""
 TIMESTEP = 0.001
 """Time step of the simulation [s]."""
 COLUMNS = {
@@ -215,17 +218,57 @@ def replay(recording: Recording, engine: str = "mujoco", timestep: float = TIMES
 def estimate_velocity(recording: Recording) -> Float[np.ndarray, " 6"]:
     """Velocity of the centre of mass [m/s] and angular velocity [rad/s] in the first frame.
 
-    Parabolas are fitted to the centre of mass and to the rotation since the first frame, over the frames of the first
-    ``ESTIMATE_TIME``; straight lines where there are fewer than four.
+    They are fitted to the frames of the first ``ESTIMATE_TIME``, up to the first contact with the table, as free
+    flight: gravity is known, and the angular momentum stays the same. An object that is in the air in fewer than three
+    of them is taken to move steadily: parabolas are fitted to the centre of mass and to the rotation since the first
+    frame, or straight lines where there are fewer than four frames.
     """
     num = max(int((recording.times <= ESTIMATE_TIME).sum()), min(3, len(recording.times)))
-    times, poses = recording.times[:num], recording.poses[:num]
-    rotations = quaternion_to_matrix(poses[:, 3:])
-    com = poses[:, :3] + rotations @ recording.body.mass.com
+    free = _frames_in_flight(recording, num)
+    flies = free >= 3
+    times, poses = (each[: free if flies else num] for each in (recording.times, recording.poses))
+    rotations, mass = quaternion_to_matrix(poses[:, 3:]), recording.body.mass
+    com = poses[:, :3] + rotations @ mass.com
     turned = Rotation.from_matrix(rotations @ rotations[0].T).as_rotvec()
+    if flies:
+        fallen = 0.5 * np.outer(times**2, recording.contact_parameters.gravity)
+        linear = np.linalg.lstsq(np.vander(times, 2, increasing=True), com - fallen, rcond=None)[0][1]
+        return np.concatenate([linear, _spin_in_flight(times, rotations, turned, mass.inertia)])
     powers = np.vander(times, 3 if num >= 4 else 2, increasing=True)
     solution = np.linalg.lstsq(powers, np.hstack([com, turned]), rcond=None)[0]
     return solution[1]
+
+
+def _frames_in_flight(recording: Recording, most: int) -> int:
+    """Number of the first frames, at most so many, before the object meets the table.
+
+    An object whose next frame would be in the table has touched it by then, even where that frame shows it above.
+    """
+    heights = np.array([recording.body.lowest(pose) for pose in recording.poses[:most]])
+    speeds = np.diff(heights) / np.diff(recording.times[:most])
+    expected = heights.copy()
+    expected[2:] = heights[1:-1] + speeds[:-1] * np.diff(recording.times[:most])[1:]
+    return int(np.argmin([*(np.minimum(heights, expected) > CLEARANCE), False]))
+
+
+def _spin_in_flight(
+    times: Float[np.ndarray, " time"],
+    rotations: Float[np.ndarray, "time 3 3"],
+    turned: Float[np.ndarray, "time 3"],
+    inertia: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, " 3"]:
+    """Angular velocity at the first time [rad/s] of a body without torque.
+
+    The rotation vector since the first frame grows by ``J(turned) R inertia^-1 R^T L``, with the inverse left Jacobian
+    J of SO(3) (Sola et al., 2018, equation 146) and the constant angular momentum L: linear in L, which is fitted.
+    """
+    rates = rotations @ np.linalg.inv(inertia) @ rotations.swapaxes(1, 2)
+    skew = np.cross(turned[:, None, :], np.eye(3)).swapaxes(1, 2)
+    angle = np.maximum(np.linalg.norm(turned, axis=1), 1e-4)[:, None, None]
+    jacobian = np.eye(3) - skew / 2 + (1 / angle**2 - 0.5 / (angle * np.tan(angle / 2))) * skew @ skew
+    grown = cumulative_trapezoid(jacobian @ rates, times, axis=0, initial=0)
+    design = np.concatenate([np.broadcast_to(np.eye(3), grown.shape), grown], axis=2)
+    return rates[0] @ np.linalg.lstsq(design.reshape(-1, 6), turned.ravel(), rcond=None)[0][3:]
 
 
 def _down_error(seen: Float[np.ndarray, "3 3"], simulated: Float[np.ndarray, "3 3"], is_round: bool) -> float:

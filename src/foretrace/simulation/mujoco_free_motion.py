@@ -15,6 +15,10 @@ from foretrace.simulation.scene import add_shapes, build_scene
 from foretrace.simulation.tool import OBJECT_BIT, TABLE_BIT
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+STRONGEST_DAMPING = 3.0
+"""Damping ratio beyond which a contact that has given way hardly recovers."""
+SHORTEST_CONTACT = 2.2
+"""Least time constant of a contact [time steps]: at MuJoCo's own limit of two an impact overshoots by 5 % of its speed."""
 
 
 def play_freely(
@@ -69,14 +73,19 @@ def _bouncing(restitution: float, timestep: float) -> list[float]:
     """Time constant [s] and damping ratio of contacts that return this share of an impact's speed.
 
     MuJoCo has no coefficient of restitution: its contacts are a spring and a damper that push but never pull. They
-    are made as stiff as the time step bears.
+    are made as stiff as the time step bears. Contacts of ``STRONGEST_DAMPING`` return the least, 0.02.
     """
-
-    def returned(damping: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        # A spring and damper that let go when their force vanishes (Schwager and Poeschel, 2007).
-        root = np.sqrt(1 - damping**2)
-        return np.exp(-damping / root * np.arctan2(2 * damping * root, 2 * damping**2 - 1))
-
-    dampings = np.linspace(1e-4, 0.9999, 10000)
-    damping = float(dampings[np.argmin(np.abs(returned(dampings) - restitution))])
-    return [2 * timestep / damping, damping]
+    # A spring and damper that let go when their force vanishes (Schwager and Poeschel, 2007), below and above
+    # critical damping.
+    below, above = np.linspace(1e-4, 0.9999, 10000), np.linspace(1.0001, STRONGEST_DAMPING, 2000)
+    root, slow = np.sqrt(1 - below**2), np.sqrt(above**2 - 1)
+    returned = np.exp(
+        np.concatenate(
+            [
+                -below / root * np.arctan2(2 * below * root, 2 * below**2 - 1),
+                above / slow * np.log((above - slow) / (above + slow)),
+            ]
+        )
+    )
+    damping = float(np.concatenate([below, above])[np.argmin(np.abs(returned - restitution))])
+    return [timestep * max(2 / damping, SHORTEST_CONTACT), damping]
