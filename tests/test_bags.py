@@ -274,13 +274,69 @@ def test_bags_that_are_cut_off(tmp_path: Path, kind: str, share: float) -> None:
         list(open_recording(path).frames())
 
 
-def test_bags_without_their_description(tmp_path: Path) -> None:
-    path = bag_of(tmp_path, images(2))
-    file = next(path.glob("*.mcap"))
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_a_file_of_a_bag_without_its_folder(tmp_path: Path, kind: str) -> None:
+    """As Foxglove and `mcap merge` write them; a description of another bag beside it does not count."""
+    path = bag_of(tmp_path, images(2), plugin=kind)
+    file = next(path.glob(f"*.{kind}"))
     assert len(list(open_recording(file).frames())) == 2
     (path / "metadata.yaml").unlink()
-    with pytest.raises(PerceptionError, match=r"no metadata.yaml beside it: copy the bag's whole folder"):
+    for there in (file, path):
+        found = open_recording(there)
+        assert found.camera == CAMERA
+        assert len(list(found.frames())) == 2
+    (path / "metadata.yaml").write_text("rosbag2_bagfile_information: of a bag that was here")
+    other = file.rename(path / f"other.{kind}")
+    assert len(list(open_recording(other).frames())) == 2
+
+
+def mcap_of(folder: Path) -> Path:
+    """A bag's only file, without its folder."""
+    return next(bag_of(folder, images(3)).glob("*.mcap")).rename(folder / "one.mcap")
+
+
+def test_a_file_that_names_no_profile(tmp_path: Path) -> None:
+    file = mcap_of(tmp_path)
+    content = bytearray(file.read_bytes())
+    assert content[17:25] == b"\4\0\0\0ros2"
+    # As long as before, since the places of all that follows are in the file.
+    content[17:25] = bytes(4) + (int.from_bytes(content[25:29], "little") + 4).to_bytes(4, "little")
+    file.write_bytes(content)
+    assert len(list(open_recording(file).frames())) == 3
+    content[17:25] = b"\4\0\0\0ros1"
+    file.write_bytes(content)
+    with pytest.raises(PerceptionError, match=r"Profile is not ros2.*: it is of ROS 1"):
         open_recording(file)
+
+
+def test_bags_that_are_not_ready(tmp_path: Path) -> None:
+    file = mcap_of(tmp_path)
+    file.with_name("two.mcap").write_bytes(file.read_bytes())
+    with pytest.raises(PerceptionError, match=r"has 2 bags \(one.mcap, two.mcap\) and no metadata.yaml"):
+        open_recording(tmp_path)
+    for name, reason in (
+        ("a.bag.active", "never closed: .*reindex"),
+        ("a.mcap.zstd", "compressed: unpack it"),
+    ):
+        (tmp_path / name).write_bytes(b"")
+        with pytest.raises(PerceptionError, match=reason):
+            open_recording(tmp_path / name)
+    (tmp_path / "a.db3").write_bytes(b"")
+    (tmp_path / "a.db3-wal").write_bytes(b"messages")
+    with pytest.raises(PerceptionError, match=r"never closed, messages are still in a.db3-wal"):
+        open_recording(tmp_path / "a.db3")
+
+
+def test_a_camera_info_that_cannot_be_used_counts_as_none(tmp_path: Path) -> None:
+    said = [dataclasses.replace(one, frame="other") for one in images(2)]
+    found = open_recording(bag_of(tmp_path, said))
+    assert found.camera is None
+    assert "is of frame 'colour_frame'" in found.no_camera
+    (tmp_path / "none").mkdir()
+    assert (
+        open_recording(bag_of(tmp_path / "none", images(2), infos=False)).no_camera
+        == "there is no camera_info"
+    )
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,8 @@ def test_camera_files(tmp_path: Path) -> None:
         ({"fx": None}, "no number"),
         ({"fx": -3}, "fx = -3.0, it must be positive"),
         ({"cx": 900}, "cx = 900.0 lies outside"),
-        ({"distortion": [1, 2]}, "0, 4, 5 or 8"),
+        ({"distortion": [1, 2]}, "0, 4, 5, 8, 12 or 14"),
+        ({"version": 2}, "a fisheye lens has 4 finite"),
         ({"version": 9}, "format version 9"),
         ({"format": "x"}, "is no camera"),
     ):

@@ -48,8 +48,8 @@ def import_recording(
         at: Where it was levered, unless --contact-px says so.
         config: How the recording is read.
         contact_px: Column and row of the contact in the first frame, on the object's upper rim.
-        camera: The camera's JSON file; by default camera.json beside the recording, or what a bag or a RealSense
-            recording has.
+        camera: The camera's file, JSON or YAML of ROS, OpenCV or Kalibr; by default camera.json beside the recording,
+            or what a bag or a RealSense recording has.
         markers: Marker layout; by default markers.json beside the recording.
         object: The object's shape: a .json file from `to_dict`, an .stl or .obj mesh, or a text file with the outline's
             corners. Without it, the prism that its outline in the first frame shows.
@@ -60,7 +60,10 @@ def import_recording(
     intrinsics = camera or (None if opened.camera is not None else opened.beside(CAMERA))
     taken_by = opened.camera if intrinsics is None else PinholeCamera.load(intrinsics)
     if taken_by is None:
-        raise PerceptionError(f"{recording} names no camera: give --camera, made by `foretrace calibrate`")
+        reason = f" ({opened.no_camera})" if opened.no_camera else ""
+        raise PerceptionError(
+            f"{recording} names no camera{reason}: give --camera, made by `foretrace calibrate`"
+        )
     layout = markers or opened.beside(MARKERS)
     if layout is None:
         raise PerceptionError(f"{recording} has no {MARKERS} beside it: give --markers")

@@ -14,11 +14,19 @@ from jaxtyping import Float, Shaped
 from foretrace.errors import PerceptionError
 from foretrace.files import read_json, write_json
 from foretrace.geometry import transform_points
+from foretrace.interactions.camera_yaml import read_camera_yaml
 
 FORMAT = "foretrace-camera"
 VERSION = 1
-DISTORTION_SIZES = (0, 4, 5, 8)
+FISHEYE_VERSION = 2
+"""Version of a camera with `PinholeCamera.fisheye`, which older readers would take for one without."""
+DISTORTION_SIZES = (0, 4, 5, 8, 12, 14)
 """How many distortion coefficients OpenCV's models have."""
+FISHEYE_SIZE = 4
+"""How many its fisheye model has."""
+NO_RAY = -1e6
+"""What its fisheye model gives where no ray leads to a pixel."""
+YAML = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
@@ -42,7 +50,10 @@ class PinholeCamera:
     cy: float = 239.5
     """Row of the optical axis [pixel]."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, or the first 4 or 5; empty: no distortion."""
+    """OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty, or the first 4, 5, 8 or 12; empty:
+    no distortion."""
+    fisheye: bool = False
+    """Whether the lens is OpenCV's fisheye model (Kannala and Brandt, 2006), with distortion k1, k2, k3, k4."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "fx", "fy"):
@@ -54,10 +65,10 @@ class PinholeCamera:
                     f"camera: {name} = {getattr(self, name)} lies outside an image of {size} pixels: "
                     "check the order of the values"
                 )
-        if len(self.distortion) not in DISTORTION_SIZES or not np.isfinite(self.distortion).all():
-            raise PerceptionError(
-                f"camera: distortion {list(self.distortion)}: give 0, 4, 5 or 8 finite coefficients"
-            )
+        sizes = (FISHEYE_SIZE,) if self.fisheye else DISTORTION_SIZES
+        if len(self.distortion) not in sizes or not np.isfinite(self.distortion).all():
+            lens = "a fisheye lens has 4" if self.fisheye else "give 0, 4, 5, 8, 12 or 14"
+            raise PerceptionError(f"camera: distortion {list(self.distortion)}: {lens} finite coefficients")
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -73,7 +84,8 @@ class PinholeCamera:
         """The camera of images that are enlarged by a factor."""
         size = (round(factor * self.width), round(factor * self.height))
         centre = (factor * (self.cx + 0.5) - 0.5, factor * (self.cy + 0.5) - 0.5)
-        return PinholeCamera(*size, factor * self.fx, factor * self.fy, *centre, self.distortion)
+        focus = (factor * self.fx, factor * self.fy)
+        return PinholeCamera(*size, *focus, *centre, self.distortion, self.fisheye)
 
     def project(
         self, points: Float[np.ndarray, "k 3"], T_camera_frame: Float[np.ndarray, "4 4"]
@@ -83,11 +95,21 @@ class PinholeCamera:
         before = in_camera[:, 2] > 0
         pixels = np.full((len(points), 2), np.nan)
         if before.any():
-            found, _ = cv2.projectPoints(
-                in_camera[before], np.zeros(3), np.zeros(3), self.matrix, self.coefficients
-            )
-            pixels[before] = found.reshape(-1, 2)
+            pixels[before] = self.project_with_slopes(in_camera[before])[0]
         return pixels
+
+    def project_with_slopes(
+        self, points: Float[np.ndarray, "k 3"]
+    ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k 2 3"]]:
+        """Pixels of points before the camera, in its frame [m], and how they change with the points [pixel/m]."""
+        still = (np.zeros(3), np.zeros(3), self.matrix, self.coefficients)
+        if self.fisheye:
+            pixels, jacobian = cv2.fisheye.projectPoints(points.reshape(-1, 1, 3), *still)
+            slopes = np.asarray(jacobian)[:, 11:14]
+        else:
+            pixels, jacobian = cv2.projectPoints(points, *still)
+            slopes = np.asarray(jacobian)[:, 3:6]
+        return pixels.reshape(-1, 2), slopes.reshape(-1, 2, 3)
 
     def rays(self, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 3"]:
         """Directions of sight in the camera frame, of length 1 along z."""
@@ -96,8 +118,35 @@ class PinholeCamera:
         else:
             stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
             raw = pixels.reshape(-1, 1, 2).astype(float)
-            plane = cv2.undistortPoints(raw, self.matrix, self.coefficients, criteria=stop).reshape(-1, 2)
+            straighten = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
+            plane = straighten(raw, self.matrix, self.coefficients, criteria=stop).reshape(-1, 2)
+            if self.fisheye:  # OpenCV's sign that no ray before the camera leads there
+                plane[(plane == NO_RAY).all(axis=1)] = np.nan
         return np.column_stack([plane, np.ones(len(plane))])
+
+    def for_opencv(
+        self, pixels: Float[np.ndarray, "k 2"]
+    ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " c"]]:
+        """Pixels and coefficients for functions of OpenCV that have no fisheye model.
+
+        Of a fisheye lens: the pixels of the same rays in a camera without distortion.
+        """
+        if not self.fisheye:
+            return pixels, self.coefficients
+        return self.rays(pixels)[:, :2] * [self.fx, self.fy] + [self.cx, self.cy], np.zeros(4)
+
+    def undistortion(
+        self, T: Float[np.ndarray, "3 3"], size: tuple[int, int]
+    ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+        """Columns and rows to which each pixel of another image leads.
+
+        Args:
+            T: From (column, row, 1) of that image to a ray in the camera frame.
+            size: Its columns and rows.
+        """
+        make = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
+        columns, rows = make(self.matrix, self.coefficients, np.eye(3), np.linalg.inv(T), size, cv2.CV_32FC1)
+        return columns, rows
 
     def on_plane(
         self, pixels: Float[np.ndarray, "k 2"], T_frame_camera: Float[np.ndarray, "4 4"], height: float = 0.0
@@ -138,7 +187,10 @@ class PinholeCamera:
 
     def to_dict(self) -> dict[str, Any]:
         """The camera as plain JSON values."""
-        return {"format": FORMAT, "version": VERSION, **asdict(self), "distortion": list(self.distortion)}
+        values = asdict(self) | {"distortion": list(self.distortion)}
+        if not values.pop("fisheye"):
+            return {"format": FORMAT, "version": VERSION, **values}
+        return {"format": FORMAT, "version": FISHEYE_VERSION, **values, "fisheye": True}
 
     @classmethod
     def from_dict(cls, values: Any, name: str = "camera") -> "PinholeCamera":
@@ -149,14 +201,15 @@ class PinholeCamera:
         """
         if not isinstance(values, dict) or values.get("format") != FORMAT:
             raise PerceptionError(f'{name} is no camera: it lacks "format": "{FORMAT}"')
-        if values.get("version") != VERSION:
+        fisheye = values.get("version") == FISHEYE_VERSION
+        if values.get("version") != VERSION and not fisheye:
             raise PerceptionError(
-                f"{name} has format version {values.get('version')}, this foretrace reads {VERSION}"
+                f"{name} has format version {values.get('version')}, this one reads {VERSION} and {FISHEYE_VERSION}"
             )
         try:
             distortion = tuple(float(value) for value in values.get("distortion", ()))
             fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
-            return cls(int(values["width"]), int(values["height"]), fx, fy, cx, cy, distortion)
+            return cls(int(values["width"]), int(values["height"]), fx, fy, cx, cy, distortion, fisheye)
         except KeyError as error:
             raise PerceptionError(f"{name} lacks {error}: write it by `foretrace calibrate`") from error
         except (TypeError, ValueError) as error:
@@ -168,11 +221,14 @@ class PinholeCamera:
 
     @classmethod
     def load(cls, path: str | Path) -> "PinholeCamera":
-        """The camera in a JSON file.
+        """The camera in a file: JSON, or YAML of ROS, OpenCV or Kalibr.
 
         Raises:
             PerceptionError: The file is missing, damaged, or describes no camera.
         """
+        path = Path(path)
+        if path.suffix.lower() in YAML:
+            return cls(**read_camera_yaml(path))
         return cls.from_dict(
-            read_json(Path(path), PerceptionError, "make one with `foretrace calibrate`"), str(path)
+            read_json(path, PerceptionError, "make one with `foretrace calibrate`"), str(path)
         )

@@ -1,8 +1,10 @@
 """Recordings in bags of ROS 1 and ROS 2, read without ROS (``pip install foretrace[ros]``)."""
 
+import io
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +14,7 @@ from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import Frame
 from foretrace.perception.bag_images import is_depth, read_colour, read_depth
+from foretrace.perception.camera_info import Images, Info, camera_of
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -19,6 +22,17 @@ TOGETHER = 0.02
 """Largest time between a colour image and the depth that belongs to it [s]."""
 PATIENCE = 0.5
 """Time for which a colour image waits for a later depth image [s]."""
+MCAP_HEADER = 17
+"""Place of the profile's name in an MCAP file."""
+FAULTS = {
+    "Profile is not": "it is of ROS 1 or no recording of ROS; give one of ROS 2, or the .bag of ROS 1",
+    "timestamp order": "sort it with `mcap sort`",
+    "KeyError": "it has messages that are not of ROS 2; leave them out with `mcap filter`",
+    "not indexed": "it was never closed; repair it with `rosbag reindex`",
+}
+"""What to do by what rosbags says; otherwise the file is taken for damaged."""
+REPAIRS = {".mcap": "`mcap recover`", ".bag": "`rosbag reindex`"}
+OTHER_REPAIR = "`ros2 bag reindex`"
 
 
 class _Stream(NamedTuple):
@@ -28,12 +42,23 @@ class _Stream(NamedTuple):
     """Whether they are of depth."""
     frame: str
     """Name of the frame that they were taken in."""
+    first: Any
+    """The first message."""
 
 
-def open_bag(
-    path: Path, topic: str | None = None, depth_topic: str | None = None
-) -> tuple[Callable[[], Iterator[Frame]], PinholeCamera | None]:
-    """Frames of a bag's colour images with the depth that belongs to them, and the camera that its camera_info names.
+class Bag(NamedTuple):
+    """What is read of a bag."""
+
+    frames: Callable[[], Iterator[Frame]]
+    """Reads the colour images with the depth that belongs to them."""
+    camera: PinholeCamera | None
+    """The camera that took them, as its camera_info says; None where that cannot be used."""
+    no_camera: str
+    """Why not, in words."""
+
+
+def open_bag(path: Path, topic: str | None = None, depth_topic: str | None = None) -> Bag:
+    """A bag's colour images with the depth that belongs to them, and the camera that its camera_info names.
 
     Args:
         path: The bag.
@@ -49,7 +74,7 @@ def open_bag(
         depths = [name for name, stream in streams.items() if stream.depth]
         colour = _chosen(path, topic, colours, "image topic", "--topic")
         frame = streams[colour].frame
-        aligned = [name for name in depths if streams[name].frame == frame]
+        aligned = [name for name in depths if streams[name].frame == frame and (frame or name == depth_topic)]
         if depth_topic is not None or len(aligned) > 1:
             depth_topic = _chosen(path, depth_topic, depths, "depth topic", "--depth-topic")
             if depth_topic not in aligned:
@@ -58,8 +83,8 @@ def open_bag(
                     "record depth that is aligned with the colour images"
                 )
         depth = depth_topic or next(iter(aligned), None)
-        camera = _camera(reader, path, colour)
-    return lambda: _frames(path, colour, depth), camera
+        camera, no_camera = _camera(reader, path, colour, streams[colour])
+    return Bag(lambda: _frames(path, colour, depth), camera, no_camera)
 
 
 def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
@@ -67,7 +92,7 @@ def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
     found: dict[str, _Stream] = {}
     for topic in sorted({c.topic for c in reader.connections if c.msgtype in IMAGES}):
         for _, _, message in _messages(reader, path, [topic]):
-            found[topic] = _Stream(is_depth(message), message.header.frame_id)
+            found[topic] = _Stream(is_depth(message), message.header.frame_id, message)
             break
     return found
 
@@ -91,27 +116,54 @@ def _reader(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise PerceptionError("bags need rosbags: `pip install foretrace[ros]`") from error
-    folder = path
-    if path.suffix.lower() in (".db3", ".mcap"):
-        folder = path.parent
-        if not (folder / "metadata.yaml").is_file():
-            raise PerceptionError(
-                f"bag {path} has no metadata.yaml beside it: copy the bag's whole folder, or make one with "
-                "`ros2 bag reindex`"
-            )
     try:
-        reader = AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([_whole(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
+    except PerceptionError:
+        raise
     except Exception as error:  # every kind of damage has an exception of its own there
         raise _damaged(path, error) from error
     with closing(reader):
         yield reader
 
 
+def _whole(path: Path) -> Path:
+    """What is read of a path: the folder of a bag of several files, or the file itself."""
+    description = path.parent / "metadata.yaml"
+    if path.is_dir() or path.suffix.lower() == ".bag":
+        return path
+    if description.is_file() and path.name in description.read_text(encoding="utf-8", errors="replace"):
+        return path.parent
+    log = path.with_name(f"{path.name}-wal")
+    if log.is_file() and log.stat().st_size:
+        raise PerceptionError(
+            f"bag {path} was never closed, messages are still in {log.name}: close it with `sqlite3 {path.name} vacuum`"
+        )
+    return _McapPath(path) if path.suffix.lower() == ".mcap" else path
+
+
+class _McapPath(type(Path())):
+    """A file that names ROS 2 as its profile where it names none, as merged ones do; rosbags asks for it."""
+
+    def open(self, *args: Any, **options: Any) -> Any:
+        return _McapFile(io.FileIO(self))
+
+
+class _McapFile(io.BufferedReader):
+    def read(self, size: int | None = -1, /) -> bytes:
+        start, data = self.tell(), super().read(size)
+        nameless = start == MCAP_HEADER and data[:4] == bytes(4)
+        return b"\4\0\0\0ros2" + data[8:] if nameless else data
+
+
 def _damaged(path: Path, error: Exception) -> PerceptionError:
-    return PerceptionError(
-        f"bag {path} cannot be read ({error}): it is cut off or no bag; record or copy it again"
+    reason = f"{type(error).__name__}: {error}"
+    known = next((remedy for words, remedy in FAULTS.items() if words in reason), None)
+    repair = REPAIRS.get(path.suffix.lower(), OTHER_REPAIR)
+    remedy = (
+        known or f"it is cut off, was never closed or is no bag; copy it again, or repair it with {repair}"
     )
+    return PerceptionError(f"bag {path} cannot be read ({error}): {remedy}")
 
 
 def _messages(reader: Any, path: Path, topics: list[str]) -> Iterator[tuple[str, float, Any]]:
@@ -126,24 +178,16 @@ def _messages(reader: Any, path: Path, topics: list[str]) -> Iterator[tuple[str,
         raise _damaged(path, error) from error
 
 
-def _camera(reader: Any, path: Path, topic: str) -> PinholeCamera | None:
-    """The first camera_info beside the image topic, or the only one."""
-    infos = [c for c in reader.connections if c.msgtype == CAMERA_INFO]
-    namespace = topic.rsplit("/", 1)[0]
-    near = [c for c in infos if c.topic.startswith(namespace)] or infos
-    if not near or (len({c.topic for c in near}) > 1):
-        return None
-    for _, _, message in _messages(reader, path, [near[0].topic]):
-        k, d = (np.asarray(_either(message, name), dtype=float).ravel() for name in ("k", "d"))
-        fx, fy, cx, cy = (float(v) for v in k[[0, 4, 2, 5]])
-        distortion = tuple(float(v) for v in d) if d.any() else ()
-        return PinholeCamera(int(message.width), int(message.height), fx, fy, cx, cy, distortion)
-    return None
-
-
-def _either(message: Any, name: str) -> Any:
-    """A field that ROS 2 writes small and ROS 1 writes large."""
-    return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
+def _camera(reader: Any, path: Path, topic: str, stream: _Stream) -> tuple[PinholeCamera | None, str]:
+    """The camera of an image topic, or why it is not known."""
+    infos = []
+    for name in sorted({c.topic for c in reader.connections if c.msgtype == CAMERA_INFO}):
+        infos += [Info(name, message) for _, _, message in islice(_messages(reader, path, [name]), 1)]
+    rows, columns = read_colour(stream.first, path).shape[:2]
+    try:
+        return camera_of(Images(topic, stream.frame, (columns, rows)), infos), ""
+    except PerceptionError as error:
+        return None, str(error)
 
 
 def _frames(path: Path, colour: str, depth: str | None) -> Iterator[Frame]:

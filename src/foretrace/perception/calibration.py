@@ -117,12 +117,11 @@ class Board:
         points, pixels = self.find(image)
         if len(points) < FEWEST_CORNERS or not _spans_plane(points):
             raise PerceptionError(f"{name} {self.what_is_missing(image)}")
-        found, rvec, tvec = cv2.solvePnP(
-            points, pixels, camera.matrix, camera.coefficients, flags=cv2.SOLVEPNP_IPPE
-        )
+        pixels, coefficients = camera.for_opencv(pixels)
+        found, rvec, tvec = cv2.solvePnP(points, pixels, camera.matrix, coefficients, flags=cv2.SOLVEPNP_IPPE)
         if not found:
             raise PerceptionError(f"{name}: no pose explains the board's corners: show more of it")
-        rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, camera.coefficients, rvec, tvec)
+        rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, coefficients, rvec, tvec)
         return invert_transform(to_transform(rvec, tvec))
 
     def what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
@@ -275,10 +274,9 @@ def refine_camera(
     matches = [match for seen in detections if len((match := body.matches(seen))[0])]
     if len(matches) < FEWEST_IMAGES:
         raise PerceptionError(f"markers {body.ids} are in {len(matches)} images, {FEWEST_IMAGES} are needed")
-    if len(camera.distortion) > 5:
-        raise PerceptionError(
-            "a camera with 8 distortion coefficients cannot be refined: calibrate it with a board"
-        )
+    if len(camera.distortion) > 5 or camera.fisheye:
+        lens = "a fisheye lens" if camera.fisheye else f"{len(camera.distortion)} distortion coefficients"
+        raise PerceptionError(f"a camera with {lens} cannot be refined: calibrate it with a board")
     points, pixels = ([part.astype(np.float32) for part in parts] for parts in zip(*matches, strict=True))
     held = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_TANGENT_DIST
     held |= cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3

@@ -248,18 +248,19 @@ class MarkerBody:
             return []
         largest = max(sizes, key=lambda id: sizes[id])
         seen = np.asarray(detections.of(largest))
-        matrix, coefficients = camera.matrix, camera.coefficients
+        matrix, (seen, coefficients) = camera.matrix, camera.for_opencv(seen)
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             square(self.sides[largest]), seen, matrix, coefficients, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
         T_marker_body = invert_transform(self.placements[largest])
         points, pixels = self.matches(detections)
+        straight, _ = camera.for_opencv(pixels)
         found = []
         for rvec, tvec in zip(rvecs, tvecs, strict=True):
             T = to_transform(rvec, tvec) @ T_marker_body
             rotation, _ = cv2.Rodrigues(T[:3, :3])
             T = to_transform(
-                *cv2.solvePnPRefineLM(points, pixels, matrix, coefficients, rotation, T[:3, 3:].copy())
+                *cv2.solvePnPRefineLM(points, straight, matrix, coefficients, rotation, T[:3, 3:].copy())
             )
             error = np.linalg.norm(camera.project(points, T) - pixels, axis=1)
             seen_from = invert_transform(T @ self.placements[largest])[:3, 3]

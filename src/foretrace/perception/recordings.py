@@ -20,6 +20,11 @@ from foretrace.perception import realsense
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 BAGS = (".bag", ".mcap", ".db3")
+UNREADY = {
+    ".active": "was never closed: repair it with `rosbag reindex`, and rename it to .bag",
+    ".zstd": "is compressed: unpack it with `zstd -d`, or give the bag's folder with its metadata.yaml",
+}
+"""Endings of bags that cannot be read as they are."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,8 @@ class Recording:
     """Its notes."""
     camera: PinholeCamera | None = None
     """The camera, if the recording names it."""
+    no_camera: str = ""
+    """Why it names none, where there is a reason."""
 
     def beside(self, name: str) -> Path | None:
         """A file that belongs to the recording, if it is there."""
@@ -64,11 +71,11 @@ def open_recording(path: str | Path, topic: str | None = None, depth_topic: str 
     if path.suffix.lower() in BAGS and path.is_file() and realsense.is_recording(path):
         frames, camera = realsense.open_realsense(path)
         return Recording(path, frames, camera=camera)
-    if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+    if (bag := _bag_at(path)) is not None:
         from foretrace.perception.bags import open_bag
 
-        frames, camera = open_bag(path, topic, depth_topic)
-        return Recording(path, frames, camera=camera)
+        frames, camera, no_camera = open_bag(bag, topic, depth_topic)
+        return Recording(path, frames, camera=camera, no_camera=no_camera)
     if path.is_dir():
         notes = RecordingNotes.load(path)
         stored = path / recording_folder.CAMERA
@@ -81,6 +88,23 @@ def open_recording(path: str | Path, topic: str | None = None, depth_topic: str 
         f"a folder with {recording_folder.TIMES}, a video ({', '.join(VIDEOS)}) or a bag ({', '.join(BAGS)})"
     )
     raise PerceptionError(f"{path} is no recording that can be read: give {kinds}")
+
+
+def _bag_at(path: Path) -> Path | None:
+    """The bag that a path means, if any: itself, or the only one in a folder that says nothing else."""
+    if path.suffix.lower() in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+        return path
+    if closed := UNREADY.get(path.suffix.lower()):
+        raise PerceptionError(f"{path} {closed}")
+    if not path.is_dir() or (path / recording_folder.TIMES).exists():
+        return None
+    inside = sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS)
+    if len(inside) > 1:
+        names = ", ".join(file.name for file in inside[:3])
+        raise PerceptionError(
+            f"{path} has {len(inside)} bags ({names}) and no metadata.yaml: name one of them"
+        )
+    return inside[0] if inside else None
 
 
 def _read_times(folder: Path) -> list[tuple[float, str, str]]:

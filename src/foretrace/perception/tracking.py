@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float
@@ -273,15 +272,12 @@ def _corner_terms(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reprojection error, and its change with a small turn about the camera's axes and a small shift."""
     turned = points @ pose[:3, :3].T
-    projected, jacobian = cv2.projectPoints(
-        turned + pose[:3, 3], np.zeros(3), np.zeros(3), camera.matrix, camera.coefficients
-    )
-    by_shift = np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
+    projected, by_shift = camera.project_with_slopes(turned + pose[:3, 3])
     x, y, z = turned.T
     zero = np.zeros_like(x)
     by_turn = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)  # -[turned]x
     block = np.concatenate([by_shift @ by_turn, by_shift], axis=2).reshape(-1, 6)
-    return (projected.reshape(-1, 2) - pixels).ravel(), block
+    return (projected - pixels).ravel(), block
 
 
 def _diagonal_blocks(information: Any) -> Float[np.ndarray, "frame 6 6"]:

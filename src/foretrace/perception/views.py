@@ -159,9 +159,7 @@ def _lay_out(
     ]
     rays = T_camera_table[:3, :3] @ np.array(grid)
     rays[:, 2] += T_camera_table[:3, 3]
-    columns, rows = cv2.initUndistortRectifyMap(
-        camera.matrix, camera.coefficients, np.eye(3), np.linalg.inv(rays), (width, length), cv2.CV_32FC1
-    )
+    columns, rows = camera.undistortion(rays, (width, length))
     return cv2.remap(mask, columns, rows, cv2.INTER_LINEAR) >= 0.5
 
 
