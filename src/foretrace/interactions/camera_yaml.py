@@ -8,11 +8,12 @@ import numpy as np
 import yaml
 
 from foretrace.errors import PerceptionError
+from foretrace.files import read_text
 from foretrace.interactions.lens_models import FISHEYE, lens_of
 
 REMEDY = "give a camera file of `foretrace calibrate`, ROS (ost.yaml), OpenCV or Kalibr"
 LARGEST = 1 << 20
-"""Largest file that is parsed [byte]: cameras have a thousand."""
+"""Longest text that is parsed: cameras have a thousand characters."""
 NAMES = {
     "width": ("image_width", "width"),
     "height": ("image_height", "height"),
@@ -59,16 +60,12 @@ def read_camera_yaml(path: Path) -> dict[str, Any]:
 
 
 def _parsed(path: Path) -> dict[str, Any]:
+    text = read_text(path, PerceptionError, REMEDY)
+    if len(text) > LARGEST:
+        raise PerceptionError(f"{path} is too large for a camera: {REMEDY}")
     try:
-        if path.stat().st_size > LARGEST:
-            raise PerceptionError(f"{path} is too large for a camera: {REMEDY}")
-        text = path.read_text(encoding="utf-8-sig")
         # OpenCV's first line is none that YAML allows.
         content = yaml.load(text.removeprefix("%YAML:1.0"), _Loader)  # of plain values only
-    except FileNotFoundError:
-        raise PerceptionError(f"{path} does not exist: {REMEDY}") from None
-    except OSError as error:
-        raise PerceptionError(f"{path} cannot be read ({error.strerror}): {REMEDY}") from error
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         reason = str(getattr(error, "problem", None) or error)[:60]
         mark = getattr(error, "problem_mark", None)
