@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError
@@ -10,8 +12,10 @@ from foretrace.objects import (
     NO_BEVEL,
     Bevel,
     MeshObject,
+    Prism,
     sample_prism,
 )
+from foretrace.objects.model import fitting_bevel
 
 L_SHAPE = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.06], [0.06, 0.06], [0.06, 0.2], [0.0, 0.2]])
 
@@ -50,6 +54,26 @@ def test_mesh_and_prism_bevel_alike():
     support = mesh_object(body).support_corners + body.center_mass[:2]
     for corner in prism.support_corners:
         assert np.linalg.norm(support - corner, axis=1).min() < 1e-6
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    size=st.tuples(st.integers(20, 300), st.integers(20, 300), st.integers(2, 100)),
+    turn=st.sampled_from([0.0, np.pi / 2, 0.3, 2.5]),
+    shift=st.tuples(*[st.integers(-500, 500)] * 3),
+)
+def test_box_in_millimetres_is_the_prism(size, turn, shift):
+    box = trimesh.creation.box(size)
+    box.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
+    box.apply_translation(shift)
+    vertices = np.asarray(box.vertices, dtype=np.float32).astype(float) * 0.001  # as an STL file keeps them
+    obj = MeshObject(vertices, np.array(box.faces))
+    length, width, height = np.array(size) * 0.001
+    corners = np.array([[0, 0], [length, 0], [length, width], [0, width]])
+    prism = Prism(corners, height, fitting_bevel(corners, height))
+    (piece,) = obj.convex_pieces()
+    assert ConvexHull(piece).volume == pytest.approx(prism.mass_properties(1.0).mass, rel=1e-4)
+    assert obj.mass_properties(1.0).mass == pytest.approx(length * width * height, rel=1e-4)
 
 
 def test_mesh_that_is_not_convex_is_decomposed_the_same_way_each_time():

@@ -106,6 +106,16 @@ def test_polygons_that_are_not_convex_are_cut_exactly(seed, num_corners):
     assert_same_mass(prism.mass_properties(500.0), body, 500.0, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("seed", "num_corners"), [(60, 59), (124, 40), (262, 40)])
+def test_outlines_with_slivers_are_cut_without_a_bevel(seed, num_corners):
+    rng = np.random.default_rng(seed)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, num_corners))
+    radii = rng.uniform(0.02, 0.1, num_corners)
+    prism = Prism(radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]), bevel=NO_BEVEL)
+    volume = prism.height * polygon_area(prism.corners)
+    assert prism.mass_properties(1.0).mass == pytest.approx(volume, rel=1e-4)
+
+
 def test_merging_leaves_few_parts():
     assert len(convex_parts(L_SHAPE)) == 2
     comb = [

@@ -27,6 +27,8 @@ OUTLINE_TOLERANCE = 0.0005
 """How far the outline's polygon may leave the mesh's projection [m]."""
 FOOT_HEIGHT = 0.0005
 """Points of the mesh below this height are taken to stand on the table [m]."""
+ON_PLANE = 1e-12
+"""A vertex nearer to a cutting plane lies on it [m]."""
 DECOMPOSITION: dict[str, Any] = {
     "threshold": 0.04,
     "preprocess_mode": "off",
@@ -241,10 +243,11 @@ def clip_polytope(
 ) -> Float[np.ndarray, "m 3"]:
     """Vertices of the part of a convex body where ``normal . x >= offset``; no rows where nothing is left."""
     depth = vertices @ normal - offset
-    kept, cut = depth >= 0, depth < -1e-12
+    depth[np.abs(depth) <= ON_PLANE] = 0.0
+    kept, cut = depth >= 0, depth < 0
     if not cut.any():
         return vertices
-    if not (depth > 1e-12).any():
+    if not (depth > 0).any():
         return np.zeros((0, 3))
     inner, outer = vertices[kept], vertices[cut]
     # Every segment between a kept and a dropped vertex lies in the body, and the true edges are among them.

@@ -151,16 +151,22 @@ class Prism(ObjectModel):
     def _pieces(self) -> list[np.ndarray]:
         pieces = []
         for part, own_edges in self._parts():
-            lower = clip_edges(part, self.corners, own_edges, self.bevel.width)
-            if len(lower) and not is_convex(self.corners):
-                inside = shapely.get_coordinates(shapely.Polygon(lower).intersection(self._bottom))
-                lower = convex_hull(inside)
             layers = [(part, self.bevel.height), (part, self.height)]
-            if len(lower) >= 3 and self.bevel.height > 0:
+            if self.bevel.height > 0 and len(lower := self._lower(part, own_edges)) >= 3:
                 layers.insert(0, (lower, 0.0))
             piece = np.concatenate([np.column_stack([xy, np.full(len(xy), z)]) for xy, z in layers])
             pieces.append(read_only(np.unique(piece, axis=0)))
         return pieces
+
+    def _lower(self, part: np.ndarray, own_edges: range | list[int]) -> np.ndarray:
+        """What the bevel leaves of a convex part at the table."""
+        lower = clip_edges(part, self.corners, own_edges, self.bevel.width)
+        if len(lower) == 0 or is_convex(self.corners):
+            return lower
+        polygon = shapely.Polygon(lower)
+        # Rounding may make a sliver cross itself.
+        polygon = polygon if polygon.is_valid else polygon.convex_hull
+        return convex_hull(shapely.get_coordinates(polygon.intersection(self._bottom)))
 
     def _parts(self) -> list[tuple[np.ndarray, range | list[int]]]:
         """Convex parts of the outline, each with the edges of the outline that bevel it."""
