@@ -221,12 +221,14 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
         raise ShapeError(f"polygon with {len(corners)} corners: at least 3 are needed")
     if (far := float(np.abs(corners).max())) > LARGEST_COORDINATE:
         raise ShapeError(f"a corner lies {far:.3g} m from the origin: check unit (metres) or scale")
+    apart = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1) > SAME_CORNER
+    if apart.sum() >= 3:  # a polygon that is closed, or a corner given twice in a row
+        corners = corners[apart]
     same = KDTree(corners).query_pairs(SAME_CORNER)
     if same:
         first, second = min(same)
         raise ShapeError(
-            f"corners {first} and {second} are both {corners[first].tolist()}: "
-            "give each corner once, without closing the polygon"
+            f"corners {first} and {second} are both {corners[first].tolist()}: give each corner once, in order"
         )
     size = largest_distance(corners)
     centred = corners - corners.mean(axis=0)

@@ -30,27 +30,6 @@ def read_shape(path: Path, height: float | None = None) -> ObjectModel:
     return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)
 
 
-def read_polygon(file: Path) -> Float[np.ndarray, "n 2"]:
-    """Corners [m] from a text file with one "x y" or "x,y" per line; ``#`` starts a comment.
-
-    Raises:
-        ShapeError: The file is missing or is no such table.
-    """
-    try:
-        text = file.read_text(encoding="utf-8")
-        lines = [line.split("#")[0].replace(",", " ").strip() for line in text.splitlines()]
-        corners = np.loadtxt([line for line in lines if line] or ["nan"], ndmin=2)
-    except (OSError, ValueError) as error:
-        raise ShapeError(
-            f'cannot read corners from {file} ({error}): write one "x y" per line [m]'
-        ) from error
-    if not any(lines):
-        raise ShapeError(f'{file} holds no corners: write one "x y" per line [m]')
-    if corners.ndim != 2 or corners.shape[1] != 2:
-        raise ShapeError(f'{file} has {corners.shape[-1]} numbers per line: write one "x y" per line [m]')
-    return corners
-
-
 def read_silhouette_image(file: Path) -> UInt8[np.ndarray, "rows columns"]:
     """A silhouette's image in grey.
 
