@@ -66,6 +66,11 @@ def test_box_without_bevel_has_the_textbook_inertia():
     np.testing.assert_allclose(properties.inertia, inertia, rtol=1e-12, atol=1e-15)
 
 
+def test_a_closing_corner_and_one_given_twice_count_once():
+    closed = Prism([*RECTANGLE[:2], *RECTANGLE[1:], RECTANGLE[0] + 1e-7])
+    np.testing.assert_allclose(closed.corners, Prism(RECTANGLE).corners, rtol=0, atol=2e-7)
+
+
 @settings(max_examples=30, deadline=None)
 @given(seeds, corner_counts)
 def test_mass_properties_of_bevelled_prisms(seed, num_corners):
@@ -220,7 +225,7 @@ BAD_PRISMS = {
     "finite": dict(corners=[[0, 0], [np.inf, 0], [0, 0.1]]),
     "Self-intersection": dict(corners=[[0, 0], [0.1, 0.1], [0.1, 0], [0, 0.11]]),
     "on one line": dict(corners=[[0, 0], [0.1, 0.1], [0.2, 0.2]]),
-    "corners 0 and 3 are both": dict(corners=[[0, 0], [0.1, 0], [0, 0.1], [0, 0]]),
+    "corners 1 and 3 are both": dict(corners=[[0, 0], [0.1, 0], [0, 0.1], [0.1, 0]]),
     "size 0.008": dict(corners=RECTANGLE * 0.008 / np.hypot(0.2, 0.1)),
     "size 200": dict(corners=RECTANGLE * 200 / np.hypot(0.2, 0.1)),
     "height 2 m": dict(corners=RECTANGLE, height=2.0),

@@ -28,13 +28,14 @@ class ObjectOptions:
     """The object."""
 
     polygon: Path | None = None
-    """File with the outline's corners, one "x y" or "x,y" per line [m]."""
+    """File with the outline's corners: a table with one corner per line, GeoJSON or WKT, in metres unless --scale says
+    otherwise."""
     image: Path | None = None
     """Image of the object's silhouette, white on black; needs --scale."""
     mesh: Path | None = None
     """STL or OBJ file of the object."""
     scale: float | None = None
-    """Metres per pixel of the image, or per unit of the mesh, 1 by default."""
+    """Metres per pixel of the image, or per unit of the mesh or polygon, 1 by default."""
     height: float | None = None
     """Height of a polygon's, image's or photograph's object [m], 0.02 by default; a mesh has its own."""
 
@@ -46,21 +47,20 @@ class ObjectOptions:
             ShapeError: The object cannot be used.
         """
         from foretrace.objects import MeshObject, Prism
+        from foretrace.objects.polygon_files import read_polygon
         from foretrace.objects.prism import DEFAULT_HEIGHT
-        from foretrace.objects.shape_files import read_polygon, read_silhouette_image
+        from foretrace.objects.shape_files import read_silhouette_image
 
         given = [f"--{name}" for name in ("polygon", "image", "mesh") if getattr(self, name) is not None]
         if len(given) != 1:
             raise PredictionError(
                 f"{' and '.join(given) or 'no object'} given: give exactly one of --polygon, --image, --mesh"
             )
-        if self.scale is not None and self.polygon is not None:
-            raise PredictionError("--scale goes with --image and --mesh: write a polygon's corners in metres")
         if self.height is not None and self.mesh is not None:
             raise PredictionError("--height goes with --polygon and --image: a mesh has its own")
         height = DEFAULT_HEIGHT if self.height is None else self.height
         if self.polygon is not None:
-            return Prism(read_polygon(self.polygon), height), None
+            return Prism(read_polygon(self.polygon, self.scale), height), None
         if self.mesh is not None:
             return MeshObject.load(self.mesh, 1.0 if self.scale is None else self.scale), None
         if self.scale is None or self.image is None:

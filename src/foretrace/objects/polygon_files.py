@@ -24,6 +24,8 @@ WORD = re.compile(r"[^\W\d_]+")
 VALUE = re.compile(r"""(^|[\s,;"'])[+-]?\d|[.,]\d|\b(nan|inf|infinity|none|null|na)\b""", re.IGNORECASE)
 """What no line of headings holds."""
 WKT = re.compile(r"(SRID=\d+;)?\s*(MULTI|GEOMETRY)?(POLYGON|COLLECTION|LINESTRING|POINT)\b", re.IGNORECASE)
+MIXED = r"\s*,\s*|\s+"
+"""What parts columns where some lines have commas and others blanks."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DEGREES = {"lon", "lat", "lng", "long", "longitude", "latitude"}
 NOT_DEGREES = "project them to metres, or move the origin to the object"
@@ -81,7 +83,9 @@ def _check_unit(file: Path, corners: Float[np.ndarray, "n 2"], mapped: bool) -> 
         likely = {name: s for name, s in likely.items() if PLAUSIBLE[0] <= size * s <= PLAUSIBLE[1]}
         if likely:
             scales = " or ".join(f"--scale {value:g}" for value in likely.values())
-            raise ShapeError(f"{across}, which looks like {' or '.join(likely)}: give {scales}, or write metres")
+            raise ShapeError(
+                f"{across}, which looks like {' or '.join(likely)}: give {scales}, or write metres"
+            )
 
 
 # --- GeoJSON and WKT ----------------------------------------------------------------------------------------
@@ -94,7 +98,10 @@ def _geometry(file: Path, text: str) -> Float[np.ndarray, "n 2"]:
     try:
         # Python's reader names the place of a fault, and refuses what is nested too deeply.
         if kind == "GeoJSON":
-            found = shapely.from_geojson(json.dumps(json.loads(text)))
+            content = json.loads(text)
+            if "type" not in content:
+                raise ShapeError(f"{file} is JSON without a type of geometry: give GeoJSON with one Polygon")
+            found = shapely.from_geojson(json.dumps(content))
         else:
             found = shapely.from_wkt(re.sub(r"^SRID=\d+;", "", text, flags=re.IGNORECASE))
     except (ValueError, RecursionError, shapely.errors.ShapelyError) as error:
@@ -116,7 +123,9 @@ def _geometry(file: Path, text: str) -> Float[np.ndarray, "n 2"]:
     if len(corners) == 0:
         raise ShapeError(f"{file} holds an empty polygon: give its corners")
     if np.ptp(corners[:, 2:], axis=0).any():
-        raise ShapeError(f"{file} holds a polygon that is not level: give corners of the same z, or x and y alone")
+        raise ShapeError(
+            f"{file} holds a polygon that is not level: give corners of the same z, or x and y alone"
+        )
     return corners[:, :2]
 
 
@@ -127,13 +136,14 @@ def _table(file: Path, text: str) -> tuple[Float[np.ndarray, "n 2"], float | Non
     """Corners in a table, and the unit [m] that its headings name."""
     if text.lstrip().startswith("["):
         try:  # a list of pairs, in one line or in several
-            text = "\n".join(" ".join(map(json.dumps, pair)) for pair in json.loads(text))
+            pairs = json.loads(text.translate({ord("("): "[", ord(")"): "]"}))
+            text = "\n".join(" ".join(map(json.dumps, pair)) for pair in pairs)
         except (ValueError, TypeError, RecursionError):
             pass  # rows in brackets, as numpy prints them
     blank = str.maketrans({"\u2212": "-"} | dict.fromkeys("[](){}", " "))
     lines = (COMMENT.split(line)[0].translate(blank) for line in text.splitlines())
     rows = [Row(number, line.strip(" \r").rstrip(",;\t ")) for number, line in enumerate(lines, 1)]
-    rows = [row for row in rows if row.text.strip(",;\t\" ")]
+    rows = [row for row in rows if row.text.strip(',;\t" ')]
     first = next((k for k, row in enumerate(rows) if VALUE.search(row.text)), len(rows))
     head, rows = [row.text for row in rows[:first]], rows[first:]
     if not rows:
@@ -144,19 +154,19 @@ def _table(file: Path, text: str) -> tuple[Float[np.ndarray, "n 2"], float | Non
     units = sorted(words & UNITS.keys())
     if len(units) > 1:
         raise ShapeError(f"{file} has headings with the units {' and '.join(units)}: write one unit")
-    readings = [_read(rows, head, *way) for way in product((";", "\t", ",", None), ".,")]
+    readings = [_read(rows, head, *way) for way in product((";", "\t", ",", None, MIXED), ".,")]
     corners = [found for _, found in readings if isinstance(found, np.ndarray)]
     if not corners:
         _, fault = max(readings, key=lambda reading: reading[0])
         raise ShapeError(f"{file}, {fault}")
-    # More than one way gives the same corners: a number holds no blank, and a decimal comma stands between digits.
+    # The first ways give the same corners, if any: a number holds no blank, and a decimal comma stands between digits.
     return corners[0], UNITS[units[0]] if units else None
 
 
 def _read(
     rows: Sequence[Row], head: Sequence[str], delimiter: str | None, decimal: str
-) -> tuple[int, Float[np.ndarray, "n 2"] | str]:
-    """A table read in one way: number of lines that can be read, and the corners or the first fault."""
+) -> tuple[tuple[int, bool], Float[np.ndarray, "n 2"] | str]:
+    """A table read in one way: how far that leads, and the corners or the first fault."""
     columns = _named_columns(head, delimiter)
     found, fault, width = [], "", 0
     for row in rows:
@@ -169,7 +179,7 @@ def _read(
             wanted = 'columns parted by ";" where numbers have decimal commas'
             parted = delimiter == "," and "." not in row.text
             fault = fault or (
-                f"{place}: {row.text!r:.60} has {len(cells)} numbers per line: {wanted if parted else REMEDY}"
+                f"{place}: {row.text!r:.60} has {len(cells)} entries: {wanted if parted else REMEDY}"
             )
         elif None in values:
             column = chosen[values.index(None)]
@@ -177,16 +187,17 @@ def _read(
             fault = fault or f"{place}, column {column + 1}: {cell!r:.40} is no number: {REMEDY}"
         else:
             found.append(values)
+    far = len(found), width > 1
     if fault:
-        return len(found), fault
+        return far, fault
     corners = np.array(found, dtype=float)
     if np.ptp(corners[:, 2:], axis=0).any():
         differs = rows[int(np.argmax(corners[:, 2] != corners[0, 2]))]
-        return len(found) - 1, (
+        return far, (
             f"line {differs.line}, column 3: z is not {corners[0, 2]:g} as above: 3 numbers per line are an outline "
             f"where z is the same everywhere: {REMEDY}"
         )
-    return len(found), corners[:, :2]
+    return far, corners[:, :2]
 
 
 def _named_columns(head: Sequence[str], delimiter: str | None) -> list[int]:
@@ -204,6 +215,8 @@ def _named_columns(head: Sequence[str], delimiter: str | None) -> list[int]:
 def _split(line: str, delimiter: str | None) -> list[str]:
     if delimiter is None:
         return line.split()
+    if delimiter == MIXED:
+        return re.split(MIXED, line)
     try:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     except csv.Error:  # a cell of 130,000 letters

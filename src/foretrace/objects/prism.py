@@ -54,10 +54,11 @@ SMALLEST_PIECE = 1e-7
 class Prism(ObjectModel):
     """A polygon extruded upwards, standing on a bottom face that a bevel makes smaller than the outline.
 
-    Corners may be given clockwise: they are reordered counter-clockwise, keeping the first corner first.
+    Corners may be given clockwise: they are reordered counter-clockwise, keeping the first corner first. A corner that
+    repeats the one before it, or closes the polygon, is left out.
 
     Raises:
-        ShapeError: for fewer than three corners, values that are not finite, repeated corners, no area,
+        ShapeError: for fewer than three corners, values that are not finite, corners that meet again, no area,
             self-intersection, a size or height beyond belief, or a bevel that leaves no bottom face.
     """
 

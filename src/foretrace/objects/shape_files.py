@@ -4,17 +4,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from foretrace.errors import ShapeError
 from foretrace.files import read_json
 from foretrace.images import read_image
 from foretrace.objects import MeshObject, ObjectModel, Prism, object_from_dict
+from foretrace.objects.polygon_files import read_polygon
 from foretrace.objects.prism import DEFAULT_HEIGHT
 
 
 def read_shape(path: Path, height: float | None = None) -> ObjectModel:
-    """An object from a description (``.json``, from ``to_dict``), a mesh (``.stl``, ``.obj``) or an outline (text).
+    """An object from a description (``.json``, from ``to_dict``), a mesh (``.stl``, ``.obj``) or an outline (others).
 
     Args:
         path: The file.
@@ -26,7 +27,9 @@ def read_shape(path: Path, height: float | None = None) -> ObjectModel:
     if path.suffix.lower() in (".stl", ".obj"):
         return MeshObject.load(path)
     if path.suffix.lower() == ".json":
-        return object_from_dict(read_json(path, ShapeError, "give an object's to_dict() as JSON"))
+        content = read_json(path, ShapeError, "give an object's to_dict() as JSON")
+        if "type" not in content:  # GeoJSON names its type, an object its kind
+            return object_from_dict(content)
     return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)
 
 

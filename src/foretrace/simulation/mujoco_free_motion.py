@@ -18,7 +18,7 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 STRONGEST_DAMPING = 3.0
 """Damping ratio beyond which a contact that has given way hardly recovers."""
 SHORTEST_CONTACT = 2.2
-"""Least time constant of a contact [time steps]: at MuJoCo's own limit of 2 an impact overshoots by 5 % of its speed."""
+"""Least time constant of a contact [time steps]: at MuJoCo's limit of 2 an impact overshoots by 5 % of its speed."""
 
 
 def play_freely(
