@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -17,8 +16,8 @@ from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import Frame, RecordingNotes, read_depth, read_image
 from foretrace.perception import realsense
+from foretrace.perception.videos import VIDEOS, check_whole, video_frames
 
-VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 BAGS = (".bag", ".mcap", ".db3")
 UNREADY = {
     ".active": "was never closed: repair it with `rosbag reindex`, and rename it to .bag",
@@ -83,7 +82,8 @@ def open_recording(path: str | Path, topic: str | None = None, depth_topic: str 
         rows = _read_times(path)
         return Recording(path, lambda: _folder_frames(path, rows), notes, camera)
     if path.suffix.lower() in VIDEOS:
-        return Recording(path, lambda: _video_frames(path))
+        check_whole(path)
+        return Recording(path, lambda: video_frames(path))
     kinds = (
         f"a folder with {recording_folder.TIMES}, a video ({', '.join(VIDEOS)}) or a bag ({', '.join(BAGS)})"
     )
@@ -152,24 +152,3 @@ def _time_and_images(place: str, head: list[str], line: list[str]) -> tuple[floa
 def _folder_frames(folder: Path, rows: list[tuple[float, str, str]]) -> Iterator[Frame]:
     for time, colour, depth in rows:
         yield Frame(time, read_image(folder / colour), read_depth(folder / depth) if depth else None)
-
-
-def _video_frames(path: Path) -> Iterator[Frame]:
-    """The frames of a video, at the times that the file states."""
-    video = cv2.VideoCapture(str(path))
-    if not video.isOpened():
-        raise PerceptionError(f"video {path} cannot be opened: it is damaged or of an unknown kind")
-    stated, count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0
-    try:
-        while True:
-            there, image = video.read()
-            if not there:
-                break
-            yield Frame(video.get(cv2.CAP_PROP_POS_MSEC) / 1000, image)  # of the frame just read
-            count += 1
-    finally:
-        video.release()
-    if count == 0 or count < stated:
-        raise PerceptionError(
-            f"video {path} is cut off: it states {stated} frames, {count} can be read; copy it again"
-        )

@@ -30,6 +30,7 @@ class VideoRecorder:
         if folder.exists() and any(folder.iterdir()):
             raise RobotError(f"{folder} is in use: choose another folder")
         self._capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the sensor's pixels, as everywhere
         if not self._capture.grab():
             raise RobotError(
                 f"camera {source} gives no image: choose a number, a device or a file that OpenCV opens"
