@@ -20,7 +20,7 @@ from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Outcome
-from foretrace.interactions.recorded import add_recorded
+from foretrace.interactions.recorded import add_recorded, find_recording, place_of
 from foretrace.interactions.recording_folder import Frame, RecordingNotes, write_recording
 from foretrace.interactions.topdown import TopDownView
 from foretrace.perception.importing import Contact, ImportConfig, Imported, import_recording
@@ -159,6 +159,63 @@ def test_broken_recordings_are_refused_with_a_reason(
         open_recording(tmp_path / "nothing")
     with pytest.raises(PerceptionError, match="is no recording that can be read"):
         open_recording(folder / "markers.json")
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "said"),
+    [
+        (
+            1e3,
+            0.0,
+            r"has 0.01 frames per second by its time stamps, from 40657 to 41357 s: are they in seconds\?",
+        ),
+        (1e9, 1.7e18, r"has 1e-08 frames per second .* are they in seconds\?"),
+        (1 / 3600, 0.0, r"has 3.6e\+04 frames per second .* are they in seconds\?"),
+        (2.5, 0.0, r"has 4 frames per second .* Record at 10 frames per second or more"),
+    ],
+)
+def test_time_stamps_in_another_unit_and_slow_films(
+    recorded: tuple[Path, RecordingTruth], tmp_path: Path, factor: float, offset: float, said: str
+) -> None:
+    folder = some_of(recorded[0], tmp_path / "some", frames=8)
+    table = folder / "timestamps.csv"
+    head, *rows = csv.reader(table.read_text().splitlines())
+    with open(table, "w", newline="") as file:
+        csv.writer(file).writerows([head, *[[float(row[0]) * factor + offset, *row[1:]] for row in rows]])
+    with pytest.raises(PerceptionError, match=said):
+        look(folder)
+
+
+def test_one_frame_at_rest_is_not_enough(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
+    folder = some_of(recorded[0], tmp_path / "some", frames=8)
+    for number in (1, 2):
+        image = folder / f"colour-{number:05d}.jpg"
+        cv2.imwrite(str(image), np.full((CAMERA.height, CAMERA.width, 3), 200, np.uint8))
+    with pytest.raises(PerceptionError, match=r"seen at 40.657 s, the next time at 40.957 s: two are needed"):
+        look(folder)
+
+
+def test_a_recording_is_found_from_its_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From another folder, after both have moved, and after one has; old notes are seen from a folder above."""
+    first, work = tmp_path / "first", tmp_path / "elsewhere"
+    (first / "films" / "a").mkdir(parents=True)
+    work.mkdir()
+    monkeypatch.chdir(first)
+    notes = place_of(Path("films/a"), Path("data/set"))
+    assert notes["recording"] == "../../films/a"
+    (first / "data" / "set").mkdir(parents=True)
+    monkeypatch.chdir(work)
+    for one in (notes, {"recording": "films/a"}, {"recording": str(first / "films" / "a")}):
+        assert find_recording(first / "data" / "set", one).samefile(first / "films" / "a")
+    (first / "data" / "set").rename(work / "set")
+    assert find_recording(Path("set"), notes).samefile(first / "films" / "a")
+    (work / "set").rename(first / "data" / "set")
+    second = first.rename(tmp_path / "second")
+    for one in (notes, {"recording": "films/a"}):
+        assert find_recording(second / "data" / "set", one).samefile(second / "films" / "a")
+    (second / "films" / "a").rmdir()
+    with pytest.raises(DatasetError, match=r"no longer at .*: say where it is with --recording"):
+        find_recording(second / "data" / "set", notes)
 
 
 def test_why_no_marker_is_found(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:

@@ -15,31 +15,40 @@ from foretrace.imagined import ImaginedEffect
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
-from foretrace.interactions.recorded import read_notes
+from foretrace.interactions.recorded import find_recording, read_notes
 from foretrace.interactions.recording_folder import Frame
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay, write_video
-from foretrace.perception.recordings import open_recording
+from foretrace.perception.recordings import Recording, open_recording
 from foretrace.predictor import load_predictor
 from foretrace.trajectories import interpolate_poses
 
+SAME_TIME = 0.001
+"""Time stamps of a recording may be told so differently [s]."""
+
 
 def overlay(
-    data: Positional[Path], id: Positional[int], out: Path, run: Path | None = None, topic: str | None = None
+    data: Positional[Path],
+    id: Positional[int],
+    out: Path,
+    run: Path | None = None,
+    recording: Path | None = None,
+    topic: str | None = None,
 ) -> None:
     """Draw what a predictor expects and what was observed over an imported recording, frame by frame, as an MP4.
 
     Beside it an image is written that shows both paths from the side, its name with "-side.png" in place of ".mp4".
 
     Red: predicted, before the touch. Green: observed so far. White: the object's outline. A translucent tube: how
-    uncertain the prediction is, if the predictor predicts it. Needs foretrace[video], and the recording
-    where it was when it was imported.
+    uncertain the prediction is, if the predictor predicts it. Needs foretrace[video].
 
     Args:
         data: Folder of the recorded data set.
         id: Number of the interaction.
         out: The .mp4 file to write.
         run: Folder of the training; by default the predictor that comes with foretrace.
-        topic: Image topic of a bag, if it has several.
+        recording: The recording, if it is neither where it was when it was imported nor where the data set has moved to
+            with it.
+        topic: Image topic of a bag, if it has several; by default the one that was imported.
     """
     if out.suffix.lower() != ".mp4":
         raise PerceptionError(f"cannot write a video to {out}: choose a name that ends in .mp4")
@@ -50,9 +59,9 @@ def overlay(
         raise DatasetError(f"{data} has no recording {id}: give a data set that `foretrace import` made")
     row = int(rows[0])
     imagined = load_predictor(run).imagine_batch(dataset[row : row + 1].batch())[0]
-    recording = open_recording(notes["recording"], topic)
+    opened = open_recording(recording or find_recording(data, notes), topic or notes.get("topic"))
     times = np.array(notes["frame_times"])
-    images = _drawn(recording.frames(), notes, dataset[row], imagined)
+    images = _drawn(_same(opened, times), notes, dataset[row], imagined)
     count = write_video(out, images, float(1 / np.median(np.diff(times))))
     print(f"{count} frames: {out}")
     effect, side = dataset[row].effect, out.with_name(f"{out.stem}-side.png")
@@ -62,6 +71,17 @@ def overlay(
     slips = "" if end is None else f", slips at {end:.1f} s"
     side_figure(*paths, f"Recording {id}: {effect.outcome}{slips}".replace("slipped, ", "")).savefig(side)
     print(side)
+
+
+def _same(opened: Recording, times: np.ndarray) -> Iterator[Frame]:
+    """The frames of a recording, as long as they are those that were imported."""
+    for number, frame in enumerate(opened.frames()):
+        if number >= len(times) or abs(frame.time - times[number]) > SAME_TIME:
+            raise PerceptionError(
+                f"frame {number} of {opened.path} at {frame.time:.3f} s is none of the recording that was imported: "
+                "name the right one with --recording, or import this one"
+            )
+        yield frame
 
 
 def _drawn(
@@ -74,7 +94,8 @@ def _drawn(
     rim = np.column_stack([obj.corners, np.full(len(obj.corners), obj.height)])
     poses = pose_to_matrix(effect.pose_trajectory)
     radius = radius_of(imagined)
-    for frame in frames:
+    for number, frame in enumerate(frames):
+        camera.check_image(frame.image, f"frame {number} of the recording")
         time = frame.time - notes["start"]
         here = interpolate_poses(effect.times, poses, np.array([time]))[0]
         paths = {

@@ -1,5 +1,6 @@
 """The command that imports a recording."""
 
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +12,7 @@ from foretrace.cli.contact import ContactOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.interactions.recorded import add_recorded
+from foretrace.interactions.recorded import add_recorded, place_of
 from foretrace.interactions.recording_folder import CAMERA, MARKERS
 from foretrace.objects.shape_files import read_shape
 from foretrace.perception import importing
@@ -70,7 +71,9 @@ def import_recording(
     where = Contact(at.contact, contact_px, at.share)
     shape = None if object is None else read_shape(object, config.height)
     found = importing.import_recording(opened, taken_by, MarkerLayout.load(layout), where, shape, config)
-    id = add_recorded(out, found.interaction, _notes(recording, taken_by, found))
+    id = add_recorded(
+        out, found.interaction, _notes(place_of(recording, out) | {"topic": topic}, taken_by, found)
+    )
     effect, track = found.interaction.effect, found.track
     missing = int((~track.seen).sum())
     print(
@@ -82,7 +85,7 @@ def import_recording(
     print(f"data set: {out}")
 
 
-def _notes(recording: Path, camera: PinholeCamera, found: Any) -> dict[str, Any]:
+def _notes(place: Mapping[str, Any], camera: PinholeCamera, found: Any) -> dict[str, Any]:
     """What is kept beside an interaction: enough to draw it onto the recording again."""
 
     def plain(values: np.ndarray) -> list[float | None]:
@@ -91,7 +94,7 @@ def _notes(recording: Path, camera: PinholeCamera, found: Any) -> dict[str, Any]
     track = found.track
     deviations = np.sqrt(np.diagonal(track.covariance, axis1=1, axis2=2))
     return {
-        "recording": str(recording),
+        **place,
         "camera": camera.to_dict(),
         "T_action_camera": found.T_action_camera.tolist(),
         "start": found.start,

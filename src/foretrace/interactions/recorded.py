@@ -1,6 +1,7 @@
 """Data sets of recorded interactions, which grow one by one; read by `Dataset.open` like any other."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +41,38 @@ def read_notes(folder: Path, id: int) -> dict[str, Any]:
         if not isinstance(notes.get(name), kind):
             raise DatasetError(f"{path} lacks {name}: import the recording again")
     return notes
+
+
+def place_of(recording: Path, folder: Path) -> dict[str, str]:
+    """What the notes of a data set in a folder say about where a recording lies."""
+    here = recording.resolve()
+    try:
+        seen_from = Path(os.path.relpath(here, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        seen_from = str(here)
+    return {"recording": seen_from, "recording_path": str(here)}
+
+
+def find_recording(folder: Path, notes: Mapping[str, Any]) -> Path:
+    """The recording that an interaction is from, seen from its data set or where it was when it was imported.
+
+    Args:
+        folder: The data set's folder.
+        notes: What `read_notes` gives. Older ones name the recording as it was named to `import`, seen from a folder
+            that may be above the data set.
+
+    Raises:
+        DatasetError: It is at none of these places.
+    """
+    noted = Path(notes["recording"])
+    above = [parent / noted for parent in folder.resolve().parents]
+    places = [folder / noted, Path(notes.get("recording_path", noted)), noted, *above]
+    found = next((place for place in places if place.exists()), None)
+    if found is None:
+        raise DatasetError(
+            f"the recording is no longer at {places[0]} or {places[1]}: say where it is with --recording"
+        )
+    return found
 
 
 def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any]) -> int:

@@ -44,6 +44,8 @@ ONSET_SHIFT = 0.001
 """How far that is [m]."""
 REST_TIME = 0.2
 """Least time for which the object lies at rest before it moves [s]."""
+SHORTEST_STEP = 0.001
+"""Least time from frame to frame [s]: shorter ones are no seconds."""
 TABLE_FRAMES = 15
 """Frames whose table markers are measured with care; the camera stands still."""
 LEAST_LEVEL = 0.03
@@ -189,6 +191,7 @@ def _detect_all(
         if hopeless is None and not (table | thing) & set(seen.ids.tolist()):
             hopeless = frame.image
     check_times(np.array(times), f" of {recording.path}")
+    _check_rate(np.array(times), recording)
     for name, ids in (("object", thing), ("table", table)):
         count = sum(bool(ids & set(seen.ids.tolist())) for seen in detections)
         if count < 2:
@@ -197,6 +200,16 @@ def _detect_all(
                 f"{_excuse(first[0].image if hopeless is None else hopeless, layout)}"
             )
     return first, np.array(times), detections
+
+
+def _check_rate(times: Float[np.ndarray, " frame"], recording: Recording) -> None:
+    """Refuse too few frames per second, and time stamps in another unit than seconds."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else REST_TIME
+    if not SHORTEST_STEP <= step <= REST_TIME + 1e-6:
+        raise PerceptionError(
+            f"{recording.path} has {1 / step:.3g} frames per second by its time stamps, from {times[0]:.10g} to "
+            f"{times[-1]:.10g} s: are they in seconds? Record at 10 frames per second or more"
+        )
 
 
 def _excuse(image: UInt8[np.ndarray, "rows columns 3"], layout: MarkerLayout) -> str:
@@ -220,11 +233,18 @@ def _rest(
     """The frames at the beginning in which the object lies still."""
     there = np.isfinite(T_table_body[:, 0, 0])
     begin = times[there][0]
-    early = there & (times <= begin + REST_TIME)
-    shift = np.linalg.norm(T_table_body[early, :3, 3] - T_table_body[early][0, :3, 3], axis=1)
-    if early.sum() < 2 or shift.max() > 3 * ONSET_SHIFT:
+    early = there & (times <= begin + REST_TIME + 1e-6)
+    if early.sum() < 2:
+        after = times[there][1:2]
+        said = f"the next time at {after[0]:.3f} s" if len(after) else "and never again"
         raise PerceptionError(
-            f"the object moves by {1e3 * shift.max(initial=0):.1f} mm in the recording's first {REST_TIME} s: start "
+            f"the object's markers are seen at {begin:.3f} s, {said}: two are needed in the first {REST_TIME} s; "
+            "record at 10 frames per second or more"
+        )
+    shift = np.linalg.norm(T_table_body[early, :3, 3] - T_table_body[early][0, :3, 3], axis=1)
+    if shift.max() > 3 * ONSET_SHIFT:
+        raise PerceptionError(
+            f"the object moves by {1e3 * shift.max():.1f} mm in the recording's first {REST_TIME} s: start "
             "recording before the blade touches it"
         )
     return early
