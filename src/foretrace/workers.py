@@ -1,7 +1,10 @@
 """The one way to run many jobs: local processes, progress on the console, Ctrl-C, workers that are killed."""
 
+import ctypes
 import os
 import signal
+import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -20,6 +23,10 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MOST_WORKERS = 1024
+PARENT_PERIOD = 1.0
+"""Seconds between two looks of a worker at whether its parent lives."""
+PR_SET_PDEATHSIG = 1
+"""Linux's prctl: the signal that a process gets when its parent ends."""
 PLAIN_REPORT_PERIOD = 10.0
 """Seconds between two lines of progress where there is no terminal."""
 
@@ -49,7 +56,7 @@ def run_jobs(
 ) -> Generator[Result, None, None]:
     """Results of a function over many jobs, each as soon as it is there.
 
-    The processes never hear Ctrl-C: this one stops them. They end by themselves when this one is killed.
+    The processes never hear Ctrl-C: this one stops them. When this one is killed they end, whatever they are doing.
 
     Args:
         function: Runs one job in any process: a function or a picklable object, whose result depends on the job alone.
@@ -63,15 +70,17 @@ def run_jobs(
     Raises:
         ForetraceError: Of the given class: a process was killed; or any that the function raises.
     """
+    begin = {"initializer": _begin_worker, "initargs": (os.getpid(),)}
+    num = max(1, min(workers, len(jobs)))
     with (
-        parallel_config("loky", n_jobs=max(1, min(workers, len(jobs))), inner_max_num_threads=threads),
+        parallel_config("loky", n_jobs=num, inner_max_num_threads=threads, **begin),
         warnings.catch_warnings(),
     ):
         warnings.filterwarnings("ignore", message=".*still being processed by the workers")  # after Ctrl-C
         order = "generator" if ordered else "generator_unordered"
         # One at a time: joblib would hand over short jobs in batches, and hold results back until a batch is done.
         parallel = Parallel(return_as=order, batch_size=1, pre_dispatch=ahead)  # pyright: ignore[reportArgumentType]
-        calls = (delayed(_run)(function, job, os.getpid()) for job in jobs)
+        calls = (delayed(function)(job) for job in jobs)
         try:
             with _ctrl_c_later():
                 results = cast(Generator[Result, None, None], parallel(calls))
@@ -84,13 +93,25 @@ def run_jobs(
             ) from reason
 
 
-def _run(function: Callable[[Job], Result], job: Job, parent: int) -> Result:
-    """One job, in a worker or (with one worker) in the parent itself."""
-    if os.getpid() != parent:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-        if os.getppid() != parent:
-            os._exit(1)  # the parent was killed: nothing waits for this result
-    return function(job)
+def _begin_worker(parent: int) -> None:
+    """What a worker does before its first job: it will not hear Ctrl-C, and ends with its parent.
+
+    A worker may wait without end once its parent is gone: for a job, or for room in a pipe that nothing else reads, and
+    whose other end the workers themselves hold open.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    if os.name != "posix":
+        return
+    if sys.platform == "linux":  # even in the middle of compiled code
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """Wait for the end of the parent, and end this process."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_PERIOD)
+    os._exit(1)
 
 
 @contextmanager
