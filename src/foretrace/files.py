@@ -1,10 +1,15 @@
 """Files that are either whole or absent, JSON with a format and a version, folders with one writer."""
 
 import hashlib
+import itertools
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+import platform
+import re
+import shutil
+import time
+from collections.abc import Container, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,7 +21,14 @@ LOCK = ".lock"
 LARGEST_TEXT = 2**28
 """Bytes of text that are read; what is longer, or never ends, is no file that foretrace reads."""
 PARTIAL = ".partial"
-"""Ending of a file that is being written; what has it is the rest of an interrupted run."""
+"""Ending of a file or folder that is being written."""
+DRAFT = re.compile(rf"\..*\.(?P<here>[0-9a-f]{{6}})-(?P<process>\d+)-\d+{re.escape(PARTIAL)}", re.DOTALL)
+"""Their names, which tell whose they are."""
+OLD = 24 * 3600.0
+"""A draft last touched longer ago is the rest of an interrupted run, whoever has its process number now [s]."""
+_numbers = itertools.count()
+_drafts: set[str] = set()
+"""What this process is writing."""
 
 
 def as_path(path: Any, error: type[ForetraceError]) -> Path:
@@ -48,22 +60,98 @@ def make_folder(folder: Path, error: type[ForetraceError]) -> None:
 def atomic_path(path: Path) -> Iterator[Path]:
     """A name to write to; the file gets its own name at the end of the block, or is removed after an error.
 
-    Every process has a name of its own, so that several may write the same file at once: the last one stays.
+    Every write has a name of its own, so that several may write the same file at once: the last one stays.
+
+    Raises:
+        OSError: The system refuses to write the file, whose name it has.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
-    try:
-        yield partial
-        with open(partial, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with _draft(path) as draft:
+        try:
+            yield draft
+            with open(draft, "rb") as file:
+                os.fsync(file.fileno())
+            os.replace(draft, path)
+        except OSError as error:
+            if error.filename in (None, str(draft)) and error.errno:
+                raise OSError(error.errno, error.strerror, str(path)) from error
+            raise
     if os.name == "posix":  # the new name itself must reach the disk, too
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """An empty folder to write to, which gets its own name at the end of the block, or is removed after an error.
+
+    Raises:
+        OSError: The system refuses it, or something that is no empty folder has that name.
+    """
+    with _draft(path) as draft:
+        draft.mkdir(parents=True)
+        yield draft
+        if path.is_dir():
+            path.rmdir()  # which refuses one that is not empty
+        os.replace(draft, path)
+
+
+@contextmanager
+def _draft(path: Path) -> Iterator[Path]:
+    """A name beside a path that nothing else has; what has it at the end of the block is removed."""
+    _sweep_once(path.parent)
+    draft = path.with_name(f".{path.name[:40]}.{_here()}-{os.getpid()}-{next(_numbers)}{PARTIAL}")
+    _drafts.add(str(draft))
+    try:
+        yield draft
+    finally:
+        _remove(draft)
+        _drafts.discard(str(draft))
+
+
+@lru_cache(maxsize=1)
+def _here() -> str:
+    """This machine in the name of a draft: its process numbers are its own."""
+    return short_hash([platform.node().encode()])[:6]
+
+
+@lru_cache(maxsize=4096)
+def _sweep_once(folder: Path) -> None:
+    """Remove drafts that killed processes left in a folder, when this process first writes there."""
+    if folder.is_dir():
+        for file in folder.glob(f".*{PARTIAL}"):
+            if DRAFT.fullmatch(file.name) and _is_left(file):
+                _remove(file)
+
+
+def _is_left(file: Path) -> bool:
+    """Whether no living process writes a draft."""
+    if not (made := DRAFT.fullmatch(file.name)):
+        return True
+    try:
+        if time.time() - file.stat().st_mtime > OLD:
+            return True
+        here, process = made["here"], int(made["process"])
+        if here != _here():
+            return False
+        if process == os.getpid():
+            return str(file) not in _drafts
+        os.kill(process, 0)
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+    except OSError:
+        pass  # it lives, and is another user's
+    return False
+
+
+def _remove(file: Path) -> None:
+    if file.is_dir() and not file.is_symlink():
+        shutil.rmtree(file, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            file.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -198,13 +286,25 @@ def remove_partial(folder: Path) -> list[Path]:
     """Remove what interrupted writes left in a folder; returns what was removed."""
     leftovers = partial_files(folder)
     for file in leftovers:
-        file.unlink(missing_ok=True)
+        _remove(file)
     return leftovers
 
 
 def partial_files(folder: Path) -> list[Path]:
-    """Files that interrupted writes left in a folder, in order of their names."""
-    return sorted(file for file in folder.glob(f"*{PARTIAL}") if file.is_file())
+    """What interrupted writes left in a folder, in order of their names; not what a living process writes."""
+    return sorted(file for file in folder.glob(f"*{PARTIAL}") if _is_left(file))
+
+
+def first_stranger(folder: Path, own: Container[str] = ()) -> str | None:
+    """Name of the first entry in a folder that is not the beginning of something whose entries have given names.
+
+    Args:
+        folder: The folder; it need not exist.
+        own: Names that its entries may have, beside the lock and drafts.
+    """
+    names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    mine = (name for name in names if name != LOCK and not (name[0] == "." and name.endswith(PARTIAL)))
+    return next((name for name in mine if name not in own), None)
 
 
 def flatten(nested: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -3,8 +3,6 @@
 import csv
 import io
 import json
-import os
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,7 +13,16 @@ import pandas as pd
 
 from foretrace.errors import ResultsError
 from foretrace.evaluation.experiment import EXPERIMENTS, Experiment, Plain, Trial, trial_of
-from foretrace.files import as_json, first_difference, read_text, read_versioned, write_json, write_text
+from foretrace.files import (
+    as_json,
+    atomic_folder,
+    first_difference,
+    make_folder,
+    read_text,
+    read_versioned,
+    write_json,
+    write_text,
+)
 
 TRIALS, ROWS, SUMMARY, REPORT = "trials", "rows.csv", "summary.json", "report.md"
 TRIAL_FORMAT, SUMMARY_FORMAT = "foretrace-trial", "foretrace-results"
@@ -80,16 +87,18 @@ class Store:
         target = self.folder / TRIALS
         if target.is_dir():
             return
-        partial = self.folder / f".{TRIALS}.{os.getpid()}"
-        partial.mkdir(parents=True)
-        for trial, rows in done.items():
-            (partial / f"{trial.key}.json").write_text(
-                json.dumps(self._content(trial, rows)), encoding="utf-8"
-            )
+        make_folder(self.folder, ResultsError)
         try:
-            partial.rename(target)  # all at once: half of them would hide the table's other half
-        except OSError:  # another process was faster
-            shutil.rmtree(partial)
+            with atomic_folder(
+                target
+            ) as partial:  # all at once: half of them would hide the table's other half
+                for trial, rows in done.items():
+                    (partial / f"{trial.key}.json").write_text(
+                        json.dumps(self._content(trial, rows)), encoding="utf-8"
+                    )
+        except OSError:
+            if not target.is_dir():  # where another process was faster
+                raise
 
     def write(self, done: Mapping[Trial, Rows], summary: Mapping[str, Any], report: str) -> list[Path]:
         """Write table, summary and report; returns their paths."""

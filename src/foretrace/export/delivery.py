@@ -1,15 +1,13 @@
 """How an export reaches its folder: whole or not at all."""
 
 import importlib
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
 from foretrace.errors import ExportError
-from foretrace.files import PARTIAL
+from foretrace.files import atomic_folder, make_folder
 from foretrace.workers import ProgressReport
 
 T = TypeVar("T")
@@ -41,16 +39,9 @@ def delivered(out: Path) -> Iterator[Path]:
     """
     if out.exists() or out.is_symlink():
         raise ExportError(f"{out} exists already and is not overwritten: choose another --out, or remove it")
-    draft = out.with_name(f".{out.name}.{os.getpid()}{PARTIAL}")
-    try:
-        draft.mkdir(parents=True)
-    except OSError as error:
-        raise ExportError(f"cannot write to {out.parent} ({error.strerror}): choose another --out") from error
-    try:
+    make_folder(out.parent, ExportError)
+    with atomic_folder(out) as draft:
         yield draft
-        os.replace(draft, out)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def watched(items: Sequence[T], noun: str) -> Iterator[T]:

@@ -9,8 +9,8 @@ import pyarrow as pa
 
 from foretrace.actions import FAILED, ToolPath
 from foretrace.errors import ActionError, DatasetError
-from foretrace.files import partial_files, sole_writer
-from foretrace.interactions import storage
+from foretrace.files import partial_files, remove_partial, sole_writer
+from foretrace.interactions import recorded, storage
 from foretrace.interactions.dataset import count_outcomes
 
 QUATERNION_TOLERANCE = 1e-6
@@ -86,10 +86,9 @@ def _examine(path: Path, repair: bool) -> Diagnosis:
 
 
 def _stray_files(path: Path, repair: bool) -> Iterator[Finding]:
-    for file in [*partial_files(path), *partial_files(path / storage.SHARD_FOLDER)]:
-        if repair:
-            file.unlink()
-        yield Finding(str(file.relative_to(path)), "temporary file of an interrupted run", repair)
+    for folder in (path, path / storage.SHARD_FOLDER, path / recorded.NOTES_FOLDER):
+        for file in remove_partial(folder) if repair else partial_files(folder):
+            yield Finding(str(file.relative_to(path)), "temporary file of an interrupted run", repair)
 
 
 def _set_aside(path: Path, name: str, manifest: dict, problem: str, repair: bool) -> Finding:

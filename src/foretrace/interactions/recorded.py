@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from foretrace.errors import DatasetError
-from foretrace.files import read_json, short_hash, sole_writer, write_json
+from foretrace.files import (
+    first_stranger,
+    make_folder,
+    read_json,
+    remove_partial,
+    short_hash,
+    sole_writer,
+    write_json,
+)
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 
@@ -86,11 +94,13 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
     Raises:
         DatasetError: The folder holds something else, or a simulated data set.
     """
-    if folder.exists() and not (folder / storage.MANIFEST).is_file() and any(folder.iterdir()):
+    if not (folder / storage.MANIFEST).is_file() and not _is_beginning(folder):
         raise DatasetError(f"{folder} is no data set and not empty: choose a new folder")
-    (folder / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
-    (folder / NOTES_FOLDER).mkdir(exist_ok=True)
+    for name in (storage.SHARD_FOLDER, NOTES_FOLDER):
+        make_folder(folder / name, DatasetError)
     with sole_writer(folder, DatasetError):
+        for place in (folder, folder / storage.SHARD_FOLDER, folder / NOTES_FOLDER):
+            remove_partial(place)
         if (folder / storage.MANIFEST).is_file():
             manifest = storage.read_manifest(folder)
         else:
@@ -111,6 +121,18 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
         manifest["num_trials"] = id + 1
         storage.write_manifest(folder, manifest)
     return id
+
+
+def _is_beginning(folder: Path) -> bool:
+    """Whether a folder is new, or holds what an import leaves that was stopped before it wrote the manifest."""
+    shards, notes = folder / storage.SHARD_FOLDER, folder / NOTES_FOLDER
+    first = Path(storage.shard_name(0)).name
+    return (
+        first_stranger(folder, (storage.SHARD_FOLDER, NOTES_FOLDER)) is None
+        and first_stranger(notes, (f"{0:05d}.json",)) is None
+        # Its notes are written before its shard: without them, the shard is of a simulation that lost its manifest.
+        and first_stranger(shards, (first,) if (notes / f"{0:05d}.json").is_file() else ()) is None
+    )
 
 
 def numbered(objects: Mapping[str, int]) -> dict[str, int]:

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.errors import ActionError, DatasetError
-from foretrace.files import sole_writer
+from foretrace.files import remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.record import ExecutionOffset, Physics, Provenance
 
@@ -59,6 +59,8 @@ def upgrade(path: str | Path) -> int:
         manifest = storage.read_manifest(path, older=(1,))
         if manifest["format_version"] != 1:
             return 0
+        for folder in (path, path / storage.SHARD_FOLDER):
+            remove_partial(folder)
         names = [name for name in sorted(manifest["shards"]) if (path / name).exists()]
         for name in names:
             _converted(path, name, manifest)

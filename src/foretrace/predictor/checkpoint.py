@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from foretrace.errors import CheckpointError, TrainingError
-from foretrace.files import as_json, as_path, atomic_path, make_folder, read_versioned, write_json
+from foretrace.files import as_json, as_path, make_folder, read_versioned, write_bytes, write_json
 from foretrace.imagined.domain import read_ranges
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.base import PREDICTORS, EffectPredictor
@@ -132,10 +132,8 @@ def _upgrade(old: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Write a safetensors file atomically."""
-    with atomic_path(path) as partial:
-        save_file(
-            {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, partial, metadata
-        )
+    # By way of memory: the library's own error for a full disk is none of the system's.
+    write_bytes(path, save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata))
 
 
 def read_tensors(file: Path) -> dict[str, Tensor]:

@@ -6,6 +6,7 @@ import json
 import platform
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,12 @@ from foretrace.errors import DatasetError, TrainingError
 from foretrace.files import (
     as_json,
     first_difference,
+    first_stranger,
     make_folder,
     read_json,
+    remove_partial,
     short_hash,
+    sole_writer,
     versions_of,
     write_json,
     write_text,
@@ -97,8 +101,22 @@ class RunFolder:
         """Whether the training has run to its end."""
         return (self.path / MODEL).is_file() and not (self.path / RESUME).is_file()
 
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Hold the folder, which is made if it is not there.
+
+        Raises:
+            TrainingError: It holds something else, or another process trains there.
+        """
+        if not (self.path / CONFIG).is_file() and first_stranger(self.path):
+            raise TrainingError(f"{self.path} is not empty and holds no training: choose another folder")
+        make_folder(self.path, TrainingError)
+        with sole_writer(self.path, TrainingError):
+            remove_partial(self.path)
+            yield
+
     def start(self, predictor: EffectPredictor, training: Mapping[str, Any], resume: bool) -> None:
-        """Claim the folder for a training.
+        """Begin a training, or go on with it.
 
         Args:
             predictor: The predictor to be trained.
@@ -106,16 +124,13 @@ class RunFolder:
             resume: Whether to go on with a training that the folder holds; otherwise that is discarded.
 
         Raises:
-            TrainingError: The folder holds a training of another configuration, or something else.
+            TrainingError: The folder holds a training of another configuration.
         """
         config = as_json(describe(predictor) | {"training": training})
         if resume and (self.path / CONFIG).is_file():
             self._check(config)
             return
-        if not (self.path / CONFIG).is_file() and self.path.is_dir() and any(self.path.iterdir()):
-            raise TrainingError(f"{self.path} is not empty and holds no training: choose another folder")
-        make_folder(self.path, TrainingError)
-        for name in (RESUME, MODEL, METRICS):
+        for name in (MODEL, METRICS, RESUME):  # a model without the last one would be a finished training
             (self.path / name).unlink(missing_ok=True)
         for events in self.path.glob(f"{TENSORBOARD}/events.*"):
             events.unlink()
@@ -170,7 +185,7 @@ class RunFolder:
         write_tensors(self.path / RESUME, tensors, {"progress": json.dumps(asdict(progress))})
 
     def restore(self, predictor: EffectPredictor, optimizer: torch.optim.Optimizer) -> Progress | None:
-        """Go back to the end of the last epoch noted; None where none was.
+        """Go back to the end of the last epoch noted; None where none was, or its best model is gone.
 
         Raises:
             TrainingError: The file is damaged.
@@ -185,6 +200,8 @@ class RunFolder:
                 progress = Progress(**json.loads(opened.metadata()["progress"]))
         except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
             raise TrainingError(f"{file} cannot be read ({error}): train anew without resuming") from error
+        if progress.best_epoch and not (self.path / MODEL).is_file():
+            return None
         load_tensors(predictor, _below("model.", tensors), file)
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}

@@ -132,27 +132,43 @@ def train_predictor(
             "data": fingerprint(source, made.context),
             "rows": short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()]),
         }
-        folder.start(made, described, resume)
-        if folder.finished:
+        if resume and folder.finished:  # nothing is written
+            folder.start(made, described, resume)
             return folder.path
-        folder.write_split(source, split)
-        folder.write_environment(
-            {"seed": training.seed, "data": described["data"], "device": str(made.device)}
-            | {"precision": made.features.precision, "threads": torch.get_num_threads()}
-        )
-        train, validation = (prepare(source[rows], made) for rows in (split.train, split.validation))
-        with (
-            terminal(training.num_epochs(len(split.train)), progress) as (report, show),
-            tensorboard(folder.path / TENSORBOARD) as log,
-        ):
-
-            def show_and_log(row: Row, done: Progress) -> None:
-                log(row)
-                show(row, done)
-
-            _Training(training, made, folder, train, validation).run(report, show_and_log)
-    folder.close(made)
+        with folder.claimed():
+            folder.start(made, described, resume)
+            if not folder.finished:
+                _train_into(folder, source, split, made, training, described["data"], progress)
     return folder.path
+
+
+def _train_into(
+    folder: RunFolder,
+    source: Source,
+    split: Split,
+    predictor: EffectPredictor,
+    training: TrainConfig,
+    data: str,
+    progress: bool,
+) -> None:
+    """Train a predictor in a folder that holds its configuration; ``data`` is the fingerprint of the interactions."""
+    folder.write_split(source, split)
+    folder.write_environment(
+        {"seed": training.seed, "data": data, "device": str(predictor.device)}
+        | {"precision": predictor.features.precision, "threads": torch.get_num_threads()}
+    )
+    train, validation = (prepare(source[rows], predictor) for rows in (split.train, split.validation))
+    with (
+        terminal(training.num_epochs(len(split.train)), progress) as (report, show),
+        tensorboard(folder.path / TENSORBOARD) as log,
+    ):
+
+        def show_and_log(row: Row, done: Progress) -> None:
+            log(row)
+            show(row, done)
+
+        _Training(training, predictor, folder, train, validation).run(report, show_and_log)
+    folder.close(predictor)
 
 
 class _Memory:

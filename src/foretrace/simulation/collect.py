@@ -21,10 +21,10 @@ from rich.console import Console
 from foretrace.actions import Action, LeverUp, Screwdriver, ToolPath
 from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type, is_whole
 from foretrace.files import (
-    LOCK,
     as_json,
     as_path,
     first_difference,
+    first_stranger,
     make_folder,
     remove_partial,
     sole_writer,
@@ -179,11 +179,8 @@ def collect(
 def _prepare_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise DatasetError(f"{out} is a file; choose a folder for the data set")
-    if out.is_dir() and not (out / storage.MANIFEST).exists():
-        own = (LOCK, storage.SHARD_FOLDER, storage.MANIFEST)
-        strangers = sorted(entry.name for entry in out.iterdir() if not entry.name.startswith(own))
-        if strangers:
-            raise DatasetError(f"{out} holds {strangers[0]} and is no data set; choose a new folder")
+    if not (out / storage.MANIFEST).exists() and (stranger := first_stranger(out, (storage.SHARD_FOLDER,))):
+        raise DatasetError(f"{out} holds {stranger} and is no data set; choose a new folder")
     make_folder(out / storage.SHARD_FOLDER, DatasetError)
 
 
