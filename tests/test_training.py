@@ -20,6 +20,7 @@ from factories import QUICK_OPTIONS, fake_batch, fake_data_set
 from foretrace.errors import CheckpointError, TrainingError
 from foretrace.evaluation.metrics import evaluate_predictor
 from foretrace.features import FEATURES, Autoencoder256, NoFeatures
+from foretrace.files import LOCK
 from foretrace.interactions import dataset
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split
@@ -92,7 +93,15 @@ def test_a_run_leaves_what_is_needed(tmp_path, batch, features, state):
     run = train(batch, tmp_path / "run", replace(SMALL, epochs=2), config)
     names = {file.name for file in run.iterdir()}
     assert names == {
-        *("config.json", "model.safetensors", "metrics.csv", "environment.json", "split.json", "tensorboard")
+        *(
+            LOCK,
+            "config.json",
+            "model.safetensors",
+            "metrics.csv",
+            "environment.json",
+            "split.json",
+            "tensorboard",
+        )
     }
     assert [row["epoch"] for row in rows(run)] == ["1", "2"]
     environment = json.loads((run / "environment.json").read_text())

@@ -4,6 +4,7 @@ A command is a function; `COMMANDS` has one line about each, and where it is. It
 that ``foretrace --help`` answers at once; how its options come from its signature is in `foretrace.cli.parsing`.
 """
 
+import errno
 import os
 import signal
 import sys
@@ -57,6 +58,8 @@ COMMANDS: dict[str, Entry] = {
 
 KILLED = 128
 """Exit status after a signal that asks to end, less the signal's number: 130 after Ctrl-C, as a shell says."""
+FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
+"""What the system says of a disk without space, a used-up quota, and a file longer than it may be."""
 OUTPUT_CLOSED = 141
 """Exit status where whoever read the output has closed it, as `head` does: what a shell says of SIGPIPE."""
 
@@ -116,7 +119,10 @@ def _run(arguments: Sequence[str]) -> int:
         except OSError as error:
             # A folder in place of a file, no permission, a full disk: the system's word for it is enough.
             where = "" if error.filename is None else f"cannot use {error.filename}: "
-            return _refuse(f"{where}{error.strerror or error}: check path, permissions and free space")
+            remedy = (
+                "free some, and repeat the command" if error.errno in FULL else "check path and permissions"
+            )
+            return _refuse(f"{where}{error.strerror or error}: {remedy}")
         except ForetraceError as error:
             return _refuse(str(error))
         except KeyboardInterrupt as interrupt:

@@ -11,7 +11,7 @@ from foretrace.actions import LeverUp
 from foretrace.cli.console import say
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PerceptionError, SimulationError
-from foretrace.files import write_json
+from foretrace.files import atomic_folder, make_folder, write_json
 from foretrace.geometry import invert_transform
 from foretrace.interactions import recording_folder
 from foretrace.interactions.dataset import Dataset
@@ -44,7 +44,7 @@ def film(
     Args:
         data: Folder of the data set.
         id: Number of the interaction.
-        out: Folder to make.
+        out: Folder to make; it has its name when everything is in it.
         config: Camera, table and light.
         width: Columns of the images; they have 9/16 as many rows.
         embodiment: What moves the blade: nothing that is seen, or the whole arm; by default as in the data set.
@@ -69,13 +69,14 @@ def film(
     obj, action = shown.object, shown.action
     if not isinstance(action, LeverUp):
         raise SimulationError(f"interaction {id} is a {action.label}: only lever-ups can be filmed")
-    if board:
-        _film_board(out / "board", board, camera, seed)
-    truth = record_lever_up(obj, action, out, config, seed=seed)
-    write_json(out / recording_folder.OBJECT, obj.to_dict())
-    intrinsics = out / recording_folder.CAMERA
-    if not board:
-        camera.save(intrinsics)
+    make_folder(out.parent, PerceptionError)
+    with atomic_folder(out) as draft:
+        if board:
+            _film_board(draft / "board", board, camera, seed)
+        else:
+            camera.save(draft / recording_folder.CAMERA)
+        truth = record_lever_up(obj, action, draft, config, seed=seed)
+        write_json(draft / recording_folder.OBJECT, obj.to_dict())
     rim = truth.T_table_object[0] @ np.array([*action.contact, obj.height, 1.0])
     column, row = camera.project(rim[None, :3], invert_transform(truth.T_table_camera))[0]
     x, y = action.contact
@@ -85,9 +86,8 @@ def film(
     )
     print(f"{len(truth.times)} frames: {out}")
     if board:
-        print(
-            f"{board} images of a board: {out / 'board'}; foretrace calibrate {out / 'board'} --out {intrinsics}"
-        )
+        images, intrinsics = out / "board", out / recording_folder.CAMERA
+        print(f"{board} images of a board: {images}; foretrace calibrate {images} --out {intrinsics}")
     print(f"contact: --contact {x:.4f} {y:.4f}, in the first frame --contact-px {column:.0f} {row:.0f}")
 
 

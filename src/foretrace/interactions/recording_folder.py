@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 
 from foretrace import images
 from foretrace.errors import PerceptionError
-from foretrace.files import read_json, write_json
+from foretrace.files import atomic_path, read_json, write_json
 
 TIMES = "timestamps.csv"
 COLUMNS = ("time_s", "colour", "depth")
@@ -125,7 +125,7 @@ def write_image(path: Path, image: np.ndarray, options: Sequence[int] = ()) -> N
 
 
 def write_recording(folder: Path, frames: Iterable[Frame], notes: RecordingNotes) -> int:
-    """Write a recording's frames into a folder; returns how many.
+    """Write a recording's frames into a folder; returns how many. What was written stays, whatever ends it.
 
     Args:
         folder: An empty or new folder.
@@ -137,14 +137,16 @@ def write_recording(folder: Path, frames: Iterable[Frame], notes: RecordingNotes
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[tuple[str, str, str]] = []
-    for number, frame in enumerate(frames):
-        names = [f"colour-{number:05d}.jpg", "" if frame.depth is None else f"depth-{number:05d}.png"]
-        write_image(folder / names[0], frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        if frame.depth is not None:
-            steps = np.clip(np.rint(frame.depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
-            write_image(folder / names[1], steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        rows.append((f"{frame.time:.6f}", names[0], names[1]))
-    with open(folder / TIMES, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([COLUMNS, *rows])
-    RecordingNotes(DEPTH_UNIT, notes.action_start).save(folder)
+    try:
+        for number, frame in enumerate(frames):
+            names = [f"colour-{number:05d}.jpg", "" if frame.depth is None else f"depth-{number:05d}.png"]
+            write_image(folder / names[0], frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            if frame.depth is not None:
+                steps = np.clip(np.rint(frame.depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+                write_image(folder / names[1], steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            rows.append((f"{frame.time:.6f}", names[0], names[1]))
+    finally:
+        with atomic_path(folder / TIMES) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([COLUMNS, *rows])
+        RecordingNotes(DEPTH_UNIT, notes.action_start).save(folder)
     return len(rows)
