@@ -220,10 +220,16 @@ def test_rows_that_are_not_there_end_a_loop_as_ever(dataset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"shards": {"shards/shard-00000.parquet": None}}, "its entry of shards/shard-00000.parquet is None"),
-        ({"shards": {"shards/shard-00000.parquet": {"sha256": 3}}}, "is damaged"),
-        ({"shard_size": 0}, "its shard_size is 0"),
-        ({"num_trials": -1}, "its num_trials is -1"),
+        (
+            {"shards": {"shards/shard-00000.parquet": None}},
+            "entry shards.shards/shard-00000.parquet is null, an object",
+        ),
+        (
+            {"shards": {"shards/shard-00000.parquet": {"sha256": 3}}},
+            "00000.parquet.sha256 is 3, a text or null",
+        ),
+        ({"shard_size": 0}, "entry shard_size is 0, a whole number from 1 is expected"),
+        ({"num_trials": -1}, "entry num_trials is -1, a whole number from 0 is expected"),
     ],
 )
 def test_a_damaged_manifest_is_refused_in_one_line(changes, message, dataset, tmp_path):

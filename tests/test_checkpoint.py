@@ -114,13 +114,13 @@ def test_other_formats_are_refused(saved):
     ("change", "message"),
     [
         ({"predictor": "oracle"}, "unknown predictor 'oracle'; available: lstm"),
-        ({"predictor": ["lstm"]}, "unknown predictor"),
+        ({"predictor": ["lstm"]}, r"entry predictor is \['lstm'\], a text"),
         (
             {"config": {"hidden": 8}},
             "missing or unknown settings context, feature_options, features, residual",
         ),
-        ({"config": None}, "incomplete"),
-        ({"num_samples": "ten"}, "incomplete"),
+        ({"config": None}, "entry config is null, an object"),
+        ({"num_samples": "ten"}, "entry num_samples is 'ten', a whole number"),
         ({"outcomes": ["melted"]}, "unknown outcome 'melted'"),
     ],
 )
@@ -180,5 +180,5 @@ def test_files_of_version_1_are_read(tmp_path, batch):
     np.testing.assert_array_equal(found.com, expected.com)
     for damaged in ({"settings": None}, {"features": {"label": "outline"}}):
         edit_config(tmp_path, **damaged)
-        with pytest.raises(CheckpointError, match="incomplete"):
+        with pytest.raises(CheckpointError, match=r"entry (settings is null|features.options is missing)"):
             read_config(tmp_path)

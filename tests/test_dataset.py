@@ -219,7 +219,7 @@ def test_opening_another_version_or_a_damaged_manifest(folder):
     with pytest.raises(DatasetError, match="does not describe a foretrace-interactions"):
         Dataset.open(folder)
     path.write_text(json.dumps({**manifest, "shards": []}))
-    with pytest.raises(DatasetError, match=r"is damaged \(its shards is \[\]\)"):
+    with pytest.raises(DatasetError, match=r"entry shards is \[\], an object is expected"):
         Dataset.open(folder)
     path.write_text(json.dumps({**manifest, "format_version": 1}))
     with pytest.raises(DatasetError, match=r"upgrade it in place with `foretrace data .* --upgrade`"):

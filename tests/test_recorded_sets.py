@@ -122,7 +122,11 @@ def test_recordings_get_the_tables_of_the_paper(
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("{", "cannot be read"), ("[]", "holds a list"), ('{"recording": 3}', "lacks recording")],
+    [
+        ("{", "cannot be read"),
+        ("[]", "holds a list"),
+        ('{"recording": 3}', "entry recording is 3, a text is expected"),
+    ],
 )
 def test_damaged_notes_are_refused(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / NOTES_FOLDER).mkdir()

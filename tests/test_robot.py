@@ -185,7 +185,7 @@ def test_a_start_far_away_is_refused():
         ("{", "cannot be read as JSON .*: give a JSON file with T_table_base"),
         ("[]", "holds a list"),
         ('{"format": "foretrace-base-pose", "version": 2}', "version 2"),
-        ('{"format": "foretrace-base-pose", "version": 1}', "T_table_base = None"),
+        ('{"format": "foretrace-base-pose", "version": 1}', "entry T_table_base is missing"),
         (
             '{"format": "foretrace-base-pose", "version": 1, "T_table_base": [0, 0, 0, 1, 1, 0, 0]}',
             "unit quaternion",

@@ -25,7 +25,7 @@ def test_text_in_any_unicode(encoding, tmp_path):
     path.write_bytes(ENCODINGS[encoding] + TEXT.encode(encoding))
     assert read_text(path, DatasetError, "") == TEXT
     path.write_bytes(ENCODINGS[encoding] + '{"Größe": 1}'.encode(encoding))
-    assert read_json(path, DatasetError, "") == {"Größe": 1}
+    assert read_json(path, dict, DatasetError, "") == {"Größe": 1}
 
 
 def test_what_is_no_text(tmp_path):

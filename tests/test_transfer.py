@@ -296,9 +296,12 @@ def test_real_silhouettes_and_prisms() -> None:
     [
         ("[]", "holds a list where"),
         ("{}", "names no prism"),
-        ('{"a": {}}', "a has no corners_m"),
+        ('{"a": {}}', "entry a.corners_m is missing"),
         ('{"a": {"corners_m": [[0, 0], [1, 1]]}}', "a: polygon with 2 corners"),
-        ('{"a": {"corners_m": [[0, 0], [0.1, 0], [0, 0.1]], "mass_kg": -1}}', "mass_kg -1"),
+        (
+            '{"a": {"corners_m": [[0, 0], [0.1, 0], [0, 0.1]], "mass_kg": -1}}',
+            "entry a.mass_kg is -1, a finite number",
+        ),
         ("{", "cannot be read as JSON"),
     ],
 )

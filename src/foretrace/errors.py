@@ -4,8 +4,17 @@ Every message names the offending value and says what to do; the command line pr
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
+from math import prod
 from numbers import Integral, Real
+from reprlib import Repr
 from typing import Any
+
+SHOWN = 80
+"""Longest form of a value in a message."""
+_SHORT = Repr()
+for _limit in ("dict", "list", "tuple", "set", "frozenset", "deque", "array", "long", "string", "other"):
+    setattr(_SHORT, f"max{_limit}", SHOWN)
 
 
 class ForetraceError(Exception):
@@ -91,7 +100,7 @@ def check_ranges(
         value = getattr(thing, name)
         number = is_number(value) or getattr(value, "ndim", None) == 0
         if not (number and low <= value <= high):
-            raise error(f"{what}: {name} = {value!r} is outside {low:g} to {high:g}: {remedy}")
+            raise error(f"{what}: {name} = {shown(value)} is outside {low:g} to {high:g}: {remedy}")
 
 
 def check_type(
@@ -113,7 +122,34 @@ def check_type(
     if not isinstance(value, kinds):
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = wanted or " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
-        raise error(f"{name} of type {type(value).__name__}: give {wanted}")
+        raise wrong_type(error)(f"{name} of type {type(value).__name__}: give {wanted}")
+
+
+def shown(value: object) -> str:
+    """A value as messages show it: in one line of at most `SHOWN` characters; long arrays as shape and type."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if isinstance(shape, tuple) and dtype is not None and prod(shape) > 8:
+        return f"an array of shape {tuple(shape)} and type {dtype}"
+    try:
+        text = _SHORT.repr(value)
+    except Exception:  # whatever the value's own method raises
+        text = f"a {type(value).__name__}"
+    text = " ".join(text.split()) if "\n" in text else text
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+@lru_cache
+def wrong_type(error: type[ForetraceError]) -> type[ForetraceError]:
+    """The class of those errors of a kind that are TypeErrors, too, as Python has it for a value of a wrong type."""
+    if issubclass(error, TypeError):
+        return error
+    members = {"__module__": error.__module__, "__reduce__": lambda self: (_rebuilt, (error, self.args))}
+    return type(error.__name__, (error, TypeError), members)
+
+
+def _rebuilt(error: type[ForetraceError], arguments: tuple[Any, ...]) -> ForetraceError:
+    """An error of `wrong_type` that comes from another process."""
+    return wrong_type(error)(*arguments)
 
 
 def is_number(value: object) -> bool:

@@ -13,9 +13,12 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from foretrace.errors import ForetraceError
+from foretrace.errors import ForetraceError, shown, wrong_type
+from foretrace.schema import conform, parse_json
+
+T = TypeVar("T")
 
 LOCK = ".lock"
 LARGEST_TEXT = 2**28
@@ -38,7 +41,7 @@ def as_path(path: Any, error: type[ForetraceError]) -> Path:
         ForetraceError: Of the given class: it is no path.
     """
     if not isinstance(path, str | os.PathLike):
-        raise error(f"{path!r} is no path: give the name of a file or folder")
+        raise wrong_type(error)(f"{shown(path)} is no path: give the name of a file or folder")
     return Path(path)
 
 
@@ -205,40 +208,37 @@ def read_text(path: Path, error: type[ForetraceError], remedy: str, fallback: st
         return content.decode(fallback)
 
 
-def read_json(path: Path, error: type[ForetraceError], remedy: str) -> dict[str, Any]:
+def read_json(path: Path, schema: type[T] | Any, error: type[ForetraceError], remedy: str) -> T:
     """The object in a JSON file.
 
     Args:
         path: The file.
+        schema: What it must hold; see `foretrace.schema`.
         error: The class to raise.
         remedy: What to do about a file that cannot be read; ends the message.
 
     Raises:
-        ForetraceError: Of the given class: the file is missing, is no text or JSON, or holds no object.
+        ForetraceError: Of the given class: the file is missing, is no text or JSON, holds no object, or an entry is
+            missing or another than the schema's.
     """
-    text = read_text(path, error, remedy)
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as reason:
-        raise error(f"{path} cannot be read as JSON ({reason}): {remedy}") from reason
-    if not isinstance(content, dict):
-        raise error(f"{path} holds a {type(content).__name__} where a JSON object is expected: {remedy}")
-    return content
+    return conform(_json_object(path, error, remedy), schema, str(path), error, remedy)
 
 
 def read_versioned(
     path: Path,
+    schema: type[T] | Any,
     format: str,
     version: int,
     error: type[ForetraceError],
     remedy: str,
     key: str = "format_version",
     older: tuple[int, ...] = (),
-) -> dict[str, Any]:
+) -> T:
     """The object in a JSON file that names its format and version.
 
     Args:
         path: The file.
+        schema: What it must hold; see `foretrace.schema`.
         format: Name that its entry ``format`` must have.
         version: Version that is written today.
         error: The class to raise.
@@ -249,14 +249,25 @@ def read_versioned(
     Raises:
         ForetraceError: Of the given class: as `read_json`, or the format or its version is another one.
     """
-    content = read_json(path, error, remedy)
+    content = _json_object(path, error, remedy)
     if content.get("format") != format:
         raise error(f"{path} does not describe a {format}: {remedy}")
-    if content.get(key) not in (version, *older):
+    if isinstance(content.get(key), bool) or content.get(key) not in (version, *older):
         raise error(
-            f"{path} has format version {content.get(key)!r}, this foretrace reads version {version}: "
+            f"{path} has format version {shown(content.get(key))}, this foretrace reads version {version}: "
             f"use the foretrace that wrote it, or {remedy}"
         )
+    return conform(content, schema, str(path), error, remedy)
+
+
+def _json_object(path: Path, error: type[ForetraceError], remedy: str) -> dict[str, Any]:
+    text = read_text(path, error, remedy)
+    try:
+        content = parse_json(text)
+    except ValueError as reason:
+        raise error(f"{path} cannot be read as JSON ({reason}): {remedy}") from reason
+    if not isinstance(content, dict):
+        raise error(f"{path} holds a {type(content).__name__} where a JSON object is expected: {remedy}")
     return content
 
 

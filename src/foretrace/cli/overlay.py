@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -15,7 +14,7 @@ from foretrace.imagined import ImaginedEffect
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction
-from foretrace.interactions.recorded import find_recording, read_notes
+from foretrace.interactions.recorded import Notes, find_recording, read_notes
 from foretrace.interactions.recording_folder import Frame
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay, write_video
 from foretrace.perception.recordings import Recording, open_recording
@@ -85,7 +84,7 @@ def _same(opened: Recording, times: np.ndarray) -> Iterator[Frame]:
 
 
 def _drawn(
-    frames: Iterator[Frame], notes: dict[str, Any], interaction: Interaction, imagined: ImaginedEffect
+    frames: Iterator[Frame], notes: Notes, interaction: Interaction, imagined: ImaginedEffect
 ) -> Iterator[np.ndarray]:
     """The recording's images with outline and paths in them."""
     camera = PinholeCamera.from_dict(notes["camera"], "the recording's camera")

@@ -6,12 +6,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 import pandas as pd
 
-from foretrace.errors import ResultsError
+from foretrace.errors import ResultsError, shown
 from foretrace.evaluation.experiment import EXPERIMENTS, Experiment, Plain, Trial, trial_of
 from foretrace.files import (
     as_json,
@@ -29,7 +29,25 @@ TRIAL_FORMAT, SUMMARY_FORMAT = "foretrace-trial", "foretrace-results"
 TRIAL_VERSION, SUMMARY_VERSION = 1, 2
 REMEDY = "choose another folder, the same data and options, or remove the folder"
 
+INFINITE = ("inf", "-inf")
+"""What JSON has no number for."""
+
 Rows = list[dict[str, Plain]]
+
+
+class TrialEntries(TypedDict):
+    """Schema of a trial's file."""
+
+    identity: dict[str, Any]
+    trial: dict[str, Plain]
+    rows: list[dict[str, Plain]]
+
+
+class SummaryEntries(TypedDict):
+    """Schema of the summary, as far as it is read back."""
+
+    identity: dict[str, Any]
+    machines: NotRequired[list[dict[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -58,23 +76,17 @@ class Store:
         found = {}
         for file in sorted((self.folder / TRIALS).glob("*.json")):
             content = read_versioned(
-                file, TRIAL_FORMAT, TRIAL_VERSION, ResultsError, "remove it", key="version"
+                file, TrialEntries, TRIAL_FORMAT, TRIAL_VERSION, ResultsError, "remove it", key="version"
             )
-            for name, kind in (("identity", dict), ("trial", dict), ("rows", list)):
-                if not isinstance(content.get(name), kind):
-                    raise ResultsError(
-                        f"{file} is damaged: its {name} is {content.get(name)!r:.60}; remove it"
-                    )
-            if odd := [row for row in content["rows"] if not isinstance(row, dict)]:
-                raise ResultsError(f"{file} is damaged: a row is {odd[0]!r:.60}; remove it")
             self._check(content["identity"])
             try:
                 trial = trial_of(self.experiment.trial, content["trial"])
-            except (KeyError, TypeError, ValueError) as reason:
-                raise ResultsError(
-                    f"{file} is damaged: its trial is none ({reason!r}); remove it"
-                ) from reason
-            found[trial] = content["rows"]
+            except (KeyError, ValueError) as reason:
+                raise ResultsError(f"{file}: its trial is none ({shown(reason)}): remove it") from reason
+            found[trial] = [
+                {name: _value(value) if value in INFINITE else value for name, value in row.items()}
+                for row in content["rows"]
+            ]
         return found
 
     def save(self, trial: Trial, rows: Iterable[Mapping[str, Any]], seconds: float) -> None:
@@ -117,7 +129,11 @@ class Store:
 
     def _content(self, trial: Trial, rows: Rows) -> dict[str, Any]:
         start = {"format": TRIAL_FORMAT, "version": TRIAL_VERSION, "identity": self.identity}
-        return {**start, "trial": trial.settings, "rows": rows}
+        written = [
+            {name: str(value) if str(value) in INFINITE else value for name, value in row.items()}
+            for row in rows
+        ]
+        return {**start, "trial": trial.settings, "rows": written}
 
     def _check(self, found: Mapping[str, Any]) -> None:
         if difference := first_difference(found, self.identity):
@@ -255,10 +271,10 @@ def _value(text: str) -> Plain:
     return text
 
 
-def _read_summary(folder: Path) -> dict[str, Any]:
+def _read_summary(folder: Path) -> SummaryEntries:
     remedy = "restore it, or remove the folder"
     return read_versioned(
-        folder / SUMMARY, SUMMARY_FORMAT, SUMMARY_VERSION, ResultsError, remedy, key="version"
+        folder / SUMMARY, SummaryEntries, SUMMARY_FORMAT, SUMMARY_VERSION, ResultsError, remedy, key="version"
     )
 
 

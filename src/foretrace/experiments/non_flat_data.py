@@ -1,6 +1,5 @@
 """Data sets in which objects look alike from above."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ from jaxtyping import Int
 from foretrace.errors import DatasetError
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split, split_by_object, split_by_seed
-from foretrace.objects import ObjectModel, object_from_dict
+from foretrace.objects import ObjectModel, object_from_json
 from foretrace.predictor.states import valid_lengths
 
 Setting = Literal["by-outline", "random"]
@@ -53,9 +52,9 @@ class NonFlatData:
         dataset = Dataset.open(path)
         dataset = dataset[valid_lengths(dataset.batch()) >= 2]
         texts = dataset.table["object"].to_pylist()
-        known = {text: object_from_dict(json.loads(text)) for text in set(texts)}
+        known = {text: object_from_json(text) for text in set(texts)}
         keys = {text: _outline_key(obj) for text, obj in known.items()}
-        kinds = {text: str(json.loads(text)["kind"]) for text in known}
+        kinds = {text: obj.kind for text, obj in known.items()}
         alike = {keys[text] for text, kind in kinds.items() if kind == "cylinder"}
         names = {
             text: "flat prism" if kind == "prism" and keys[text] in alike else kind

@@ -10,16 +10,16 @@ import pandas as pd
 from matplotlib.figure import Figure
 from tyro.conf import Positional
 
-from foretrace.errors import CheckpointError
 from foretrace.evaluation.charts import BLUE, SKY, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.metrics import evaluate_predictor
 from foretrace.evaluation.tables import markdown_table, number
 from foretrace.experiments import SUMMARIES
-from foretrace.files import read_json, short_hash
+from foretrace.files import short_hash
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor import load_predictor, part_of
+from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.run_folder import fingerprint
 
 METRICS = {"full": "Over the full trajectory", "final": "At its end"}
@@ -57,7 +57,7 @@ class Predictor(Experiment):
 
     def identity(self) -> dict[str, Any]:
         """The weights, and the interactions."""
-        read_json(self.run_folder / "config.json", CheckpointError, "give the folder of a training")
+        read_config(self.run_folder)
         model = self.run_folder / "model.safetensors"
         weights = short_hash([model.read_bytes()]) if model.is_file() else None
         return {"model": weights, "data": fingerprint(self._batch)}

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -13,12 +13,15 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from msgspec import Meta
 
+from foretrace.errors import ResultsError
 from foretrace.evaluation.charts import BLUE, GREEN, VERMILLION, finish, grid, mesh
 from foretrace.experiments.transfer_objects import Subject
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.pictures.scene import draw_arrow, draw_path, draw_table
 from foretrace.pictures.style import CM, INK, OBJECT_EDGE, TOOL_COLOR, new_figure, styled
+from foretrace.schema import conform
 from foretrace.simulation.stand_in import Perturbation, StandIn, hull_of
 
 HULL_COLOR, MASK_COLOR = "#f3c98b", "#a9bdd3"
@@ -170,7 +173,7 @@ def paths_figure(
     fig = new_figure(width, height)
     cells = fig.subplots(lines, columns, squeeze=False).ravel()
     for ax, row in zip(cells, rows.to_dict("records"), strict=False):
-        paths = {name: np.array(path) / CM for name, path in json.loads(row["paths_cm"]).items()}
+        paths = {name: np.array(path) / CM for name, path in _paths(row["paths_cm"]).items()}
         slip = row.get("slip_time", np.nan)
         slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
         draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
@@ -214,3 +217,18 @@ def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: s
     ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
     draw_table(ax, 1.0)
     mesh(ax)
+
+
+def _paths(text: Any) -> dict[str, Any]:
+    """Paths [cm] from the text in a row.
+
+    Raises:
+        ResultsError: It is no such text.
+    """
+    remedy = "restore the table of rows"
+    try:
+        content = json.loads(str(text))
+    except ValueError as reason:
+        raise ResultsError(f"paths_cm is no JSON ({reason}): {remedy}") from None
+    point = Annotated[list[float], Meta(min_length=3, max_length=3)]
+    return conform(content, dict[str, list[point]], "paths_cm", ResultsError, remedy)

@@ -9,7 +9,7 @@ Nothing here needs torch: worker processes start with this module.
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 import shapely
@@ -23,6 +23,7 @@ from foretrace.objects import Prism, read_silhouette
 from foretrace.objects.everyday import EVERYDAY, HEPTAGON, PENTAGON
 from foretrace.objects.model import fitting_bevel
 from foretrace.objects.shape_files import read_silhouette_image
+from foretrace.schema import Positive, Vector2
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.stand_in import Observation, StandIn
 
@@ -160,26 +161,28 @@ def read_silhouettes(
     return subjects
 
 
+class PrismEntries(TypedDict):
+    """Schema of an object in a file of prisms."""
+
+    corners_m: list[Vector2]
+    mass_kg: NotRequired[Positive | None]
+    height_m: NotRequired[Positive]
+
+
 def read_prisms(file: Path, height: float = GIVEN_HEIGHT) -> list[Subject]:
     """Objects from a JSON file: by name, ``corners_m`` and, if they are known, ``mass_kg`` and ``height_m``.
 
     Raises:
         ShapeError: The file is missing or not such a file, or an outline is not usable.
     """
-    wanted = 'write {"name": {"corners_m": [[x, y], ...]}, ...}'
-    content = read_json(file, ShapeError, wanted)
+    remedy = 'write {"name": {"corners_m": [[x, y], ...], "mass_kg": 0.2, "height_m": 0.02}, ...}'
+    content = read_json(file, dict[str, PrismEntries], ShapeError, remedy)
     if not content:
-        raise ShapeError(f"{file} names no prism: {wanted}")
+        raise ShapeError(f"{file} names no prism: {remedy}")
     subjects = []
     for name, values in content.items():
-        if not isinstance(values, dict) or "corners_m" not in values:
-            raise ShapeError(f"{file}: {name} has no corners_m: give its corners in metres")
-        corners, mass = values["corners_m"], values.get("mass_kg")
+        corners, mass = np.array(values["corners_m"], dtype=float), values.get("mass_kg")
         thickness = values.get("height_m", height)
-        if not all(isinstance(x, int | float) and x > 0 for x in (thickness, 1.0 if mass is None else mass)):
-            raise ShapeError(
-                f"{file}: {name} has height_m {thickness!r}, mass_kg {mass!r}: give positive numbers"
-            )
         try:
             obj = Prism(corners, thickness, fitting_bevel(Prism(corners).corners, thickness))
             subjects.append(make_subject(name, "prisms", obj, mass))

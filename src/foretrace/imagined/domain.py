@@ -275,15 +275,9 @@ def ranges_of(measures: Mapping[str, Float[np.ndarray, " batch"]]) -> dict[str, 
     }
 
 
-def read_ranges(found: Any) -> dict[str, tuple[float, float]]:
-    """Ranges in a configuration file; none where it has no such entry.
-
-    Raises:
-        TypeError, ValueError, AttributeError: They have another form.
-    """
-    return {
-        name: (float(low), float(high)) for name, (low, high) in (found or {}).items() if name in MEASURES
-    }
+def known_ranges(found: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+    """Those ranges in a configuration file that this foretrace has measures for."""
+    return {name: (float(low), float(high)) for name, (low, high) in found.items() if name in MEASURES}
 
 
 def find_unusual(

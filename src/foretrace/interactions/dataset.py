@@ -1,6 +1,5 @@
 """Interactions on disk, read as they are needed."""
 
-import json
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +21,8 @@ from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
 from foretrace.interactions.batch import batch_of, chosen_rows, common_times
 from foretrace.interactions.record import Interaction
-from foretrace.objects import ObjectModel, object_from_dict
+from foretrace.objects import ObjectModel, object_from_json
+from foretrace.schema import parse_json
 
 CACHE_BYTES = 256 * 2**20
 """A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
@@ -214,7 +214,7 @@ class Dataset:
     def objects(self) -> Iterator[dict[str, Any]]:
         """Descriptions of the objects, row by row, as of ``ObjectModel.to_dict``."""
         for table in self._pieces(["object"]):
-            yield from map(json.loads, table["object"].to_pylist())
+            yield from map(parse_json, table["object"].to_pylist())
 
     def _outcome_names(self) -> list[str]:
         """Outcomes that its actions can have, and any other that it holds."""
@@ -279,8 +279,8 @@ class Dataset:
             if len(self._objects) >= MOST_OBJECTS:
                 self._objects.clear()
             try:
-                self._objects[description] = object_from_dict(json.loads(description))
-            except (ValueError, AttributeError, ShapeError) as reason:
+                self._objects[description] = object_from_json(description)
+            except ShapeError as reason:
                 raise DatasetError(
                     f"{self.path} describes an object that cannot be read ({reason}): check it with `foretrace data`"
                 ) from reason

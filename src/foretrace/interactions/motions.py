@@ -1,17 +1,20 @@
 """Recorded motions of rigid bodies: the file format, and the checks of what is read."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta
 
-from foretrace.errors import DatasetError, ForetraceError, SimulationError
+from foretrace.errors import DatasetError, ForetraceError, SimulationError, shown
 from foretrace.files import read_versioned
-from foretrace.geometry import continuous_quaternions, finite_array
+from foretrace.geometry import continuous_quaternions
 from foretrace.objects import NO_BEVEL, MassProperties, Prism
 from foretrace.objects.body import Body
+from foretrace.schema import Finite, Pose, Positive, Vector2, Vector3, conform
 from foretrace.trajectories import check_poses
 
 FORMAT = "foretrace-motion"
@@ -20,7 +23,73 @@ UNITS = "m, kg, s"
 REMEDY = "give a file of recorded motions"
 DEEPEST_START = 0.005
 """Noise may put a body this far into the table at the start [m]; it is lifted out."""
-SHAPES = ("box", "cylinder", "hull", "prism", "mesh")
+
+
+class BoxEntry(TypedDict):
+    """Schema of a box."""
+
+    size: Annotated[list[Positive], Meta(min_length=3, max_length=3)]
+
+
+class CylinderEntry(TypedDict):
+    """Schema of a cylinder along z."""
+
+    radius: Positive
+    length: Positive
+
+
+class HullEntry(TypedDict):
+    """Schema of a convex body."""
+
+    vertices: list[Vector3]
+
+
+class PrismEntry(TypedDict):
+    """Schema of a prism."""
+
+    corners: list[Vector2]
+    height: Positive
+
+
+class MeshEntry(TypedDict):
+    """Schema of a body in a mesh file."""
+
+    file: str
+    scale: NotRequired[Positive]
+
+
+SHAPES = {
+    "box": BoxEntry,
+    "cylinder": CylinderEntry,
+    "hull": HullEntry,
+    "prism": PrismEntry,
+    "mesh": MeshEntry,
+}
+"""Schema of each kind of object; lengths in metres."""
+
+
+class RecordingEntry(TypedDict):
+    """Schema of one recording; SI units."""
+
+    object: dict[str, Any]
+    mass: Positive
+    friction: Finite
+    times: list[Finite]
+    poses: list[Pose]
+    restitution: NotRequired[Finite | None]
+    rolling_friction: NotRequired[Finite | None]
+    gravity: NotRequired[Vector3 | None]
+    linear_velocity: NotRequired[Vector3 | None]
+    angular_velocity: NotRequired[Vector3 | None]
+    com: NotRequired[Vector3 | None]
+    inertia: NotRequired[Annotated[list[Vector3], Meta(min_length=3, max_length=3)] | None]
+
+
+class Motions(TypedDict):
+    """Schema of the file."""
+
+    units: str
+    recordings: Annotated[list[dict[str, Any]], Meta(min_length=1)]
 
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -82,19 +151,18 @@ def read_recordings(path: str | Path) -> list[Recording]:
         DatasetError: If the file cannot be read or does not hold what the format asks for.
     """
     path = Path(path)
-    content = read_versioned(path, FORMAT, VERSION, DatasetError, REMEDY, key="version")
-    if content.get("units") != UNITS:
-        raise DatasetError(f'{path} has units {content.get("units")!r}: convert it to "{UNITS}"')
-    entries = content.get("recordings")
-    if not isinstance(entries, list) or not entries:
-        raise DatasetError(f'{path}: "recordings" must be a list with at least one recording')
+    content = read_versioned(path, Motions, FORMAT, VERSION, DatasetError, REMEDY, key="version")
+    if content["units"] != UNITS:
+        raise DatasetError(f'{path} has units {shown(content["units"])}: convert it to "{UNITS}"')
     result = []
-    for index, entry in enumerate(entries):
-        name = str(entry.get("name", f"{path.stem}-{index}")) if isinstance(entry, dict) else str(index)
+    for index, entry in enumerate(content["recordings"]):
+        name = str(entry.get("name", f"{path.stem}-{index}"))
+        where = f"{path}: recording {name:.80}"
+        found = conform(entry, RecordingEntry, where, DatasetError, "see the format in the documentation")
         try:
-            result.append(_recording(entry, name, path.parent))
+            result.append(_recording(found, name, path.parent))
         except ForetraceError as error:
-            raise DatasetError(f"{path}: recording {name}: {error}") from error
+            raise DatasetError(f"{where}: {error}") from error
     names = [recording.name for recording in result]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -102,22 +170,20 @@ def read_recordings(path: str | Path) -> list[Recording]:
     return result
 
 
-def _recording(entry: Any, name: str, folder: Path) -> Recording:
-    if not isinstance(entry, dict):
-        raise DatasetError("it is no JSON object")
+def _recording(entry: RecordingEntry, name: str, folder: Path) -> Recording:
     body = _body(entry, folder)
     times, poses = _motion(entry)
-    gravity = _numbers(entry, "gravity", (3,), default=GRAVITY)
+    gravity = entry.get("gravity") or GRAVITY
     contact_parameters = ContactParameters(
-        friction=_number(entry, "friction"),
-        restitution=_number(entry, "restitution", 0.0),
-        rolling_friction=_number(entry, "rolling_friction", 0.0),
+        friction=float(entry["friction"]),
+        restitution=float(entry.get("restitution") or 0.0),
+        rolling_friction=float(entry.get("rolling_friction") or 0.0),
         gravity=(float(gravity[0]), float(gravity[1]), float(gravity[2])),
     )
-    velocity = None
-    if "linear_velocity" in entry or "angular_velocity" in entry:
-        parts = [_numbers(entry, key, (3,)) for key in ("linear_velocity", "angular_velocity")]
-        velocity = np.concatenate(parts)
+    velocities = [entry.get(key) for key in ("linear_velocity", "angular_velocity")]
+    if (velocities[0] is None) != (velocities[1] is None):
+        raise DatasetError("it has a linear_velocity or an angular_velocity: give both, or none")
+    velocity = None if velocities[0] is None else np.array(velocities, dtype=float).ravel()
     depth = -body.lowest(poses[0])
     if depth > DEEPEST_START:
         raise DatasetError(
@@ -129,9 +195,9 @@ def _recording(entry: Any, name: str, folder: Path) -> Recording:
     )
 
 
-def _motion(entry: dict[str, Any]) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, "time 7"]]:
-    times = _numbers(entry, "times", (None,))
-    poses = _numbers(entry, "poses", (None, 7))
+def _motion(entry: RecordingEntry) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, "time 7"]]:
+    times, poses = (np.array(entry[key], dtype=float) for key in ("times", "poses"))
+    poses = poses.reshape(-1, 7)
     check_poses(times, poses, DatasetError)
     if len(times) < 2:
         raise DatasetError("a motion needs at least two frames")
@@ -140,61 +206,38 @@ def _motion(entry: dict[str, Any]) -> tuple[Float[np.ndarray, " time"], Float[np
     return times - times[0], np.concatenate([poses[:, :3], quaternions], axis=1)
 
 
-def _body(entry: dict[str, Any], folder: Path) -> Body:
-    shape = entry.get("object")
-    if not isinstance(shape, dict) or shape.get("kind") not in SHAPES:
-        kind = shape.get("kind") if isinstance(shape, dict) else shape
-        raise DatasetError(f"object of kind {kind!r} is unknown: choose one of {', '.join(SHAPES)}")
-    mass = _number(entry, "mass")
-    if mass <= 0:
-        raise DatasetError(f"mass is {mass:g} kg, it must be above 0")
-    body = _uniform(shape, mass, folder)
-    com = _numbers(entry, "com", (3,), default=body.mass.com)
-    inertia = _numbers(entry, "inertia", (3, 3), default=body.mass.inertia)
+def _body(entry: RecordingEntry, folder: Path) -> Body:
+    shape = entry["object"]
+    kind = shape.get("kind")
+    if kind not in list(SHAPES):
+        raise DatasetError(f"object of kind {shown(kind)} is unknown: choose one of {', '.join(SHAPES)}")
+    described = conform(
+        shape, SHAPES[kind], "it", DatasetError, "lengths in metres must be above 0", "object"
+    )
+    mass = float(entry["mass"])
+    body = _uniform(described, kind, mass, folder)
+    com = np.array(body.mass.com if (com := entry.get("com")) is None else com, dtype=float)
+    inertia = np.array(body.mass.inertia if (found := entry.get("inertia")) is None else found, dtype=float)
     return Body(MassProperties(mass, com, (inertia + inertia.T) / 2), body.shapes)
 
 
-def _uniform(shape: dict[str, Any], mass: float, folder: Path) -> Body:
+def _uniform(shape: Mapping[str, Any], kind: str, mass: float, folder: Path) -> Body:
     """The body of a description, its mass spread evenly."""
-    kind = shape["kind"]
     if kind == "box":
-        return Body.box(_positive(shape, "size", (3,)).tolist(), mass)
+        return Body.box(list(map(float, shape["size"])), mass)
     if kind == "cylinder":
-        radius, length = (float(_positive(shape, key, ())) for key in ("radius", "length"))
-        return Body.cylinder(radius, length, mass)
+        return Body.cylinder(float(shape["radius"]), float(shape["length"]), mass)
     if kind == "prism":
-        corners, height = _numbers(shape, "corners", (None, 2)), float(_positive(shape, "height", ()))
-        prism = Prism(corners, height, NO_BEVEL)
+        prism = Prism(np.array(shape["corners"], dtype=float), float(shape["height"]), NO_BEVEL)
         return Body.of(prism, mass / prism.mass_properties(1.0).mass)
     if kind == "hull":
-        return Body.hull(_numbers(shape, "vertices", (None, 3)), mass)
+        return Body.hull(np.array(shape["vertices"], dtype=float), mass)
     import trimesh
 
-    file = folder / str(shape.get("file", ""))
+    file = folder / shape["file"]
     try:
         mesh = trimesh.load_mesh(file)
-        vertices = np.array(mesh.vertices, dtype=float) * _number(shape, "scale", 1.0)
+        vertices = np.array(mesh.vertices, dtype=float) * shape.get("scale", 1.0)
     except Exception as error:  # trimesh's readers raise whatever the file makes them stumble over
         raise DatasetError(f"mesh file {file} cannot be read ({error}): give an STL or OBJ file") from error
     return Body.hull(vertices, mass)
-
-
-def _number(entry: dict[str, Any], key: str, default: float | None = None) -> float:
-    return float(_numbers(entry, key, (), default))
-
-
-def _positive(entry: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    values = _numbers(entry, key, shape)
-    if not (values > 0).all():
-        raise DatasetError(f"{key} is {values.tolist()}: lengths in metres must be above 0")
-    return values
-
-
-def _numbers(
-    entry: dict[str, Any], key: str, shape: tuple[int | None, ...], default: Any = None
-) -> np.ndarray:
-    """Finite numbers in a shape; None in the shape stands for any length."""
-    if entry.get(key) is None and default is None:
-        raise DatasetError(f'"{key}" is missing')
-    values = default if entry.get(key) is None else entry[key]
-    return finite_array(f'"{key}"', values, shape, DatasetError)

@@ -5,16 +5,18 @@ The camera frame has x to the right, y down and z forward. Pixels are (column, r
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
+from msgspec import Meta
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.files import read_json, write_json
 from foretrace.geometry import transform_points
 from foretrace.interactions.camera_yaml import read_camera_yaml
+from foretrace.schema import Finite, Positive, conform
 
 FORMAT = "foretrace-camera"
 VERSION = 1
@@ -27,6 +29,20 @@ FISHEYE_SIZE = 4
 NO_RAY = -1e6
 """What its fisheye model gives where no ray leads to a pixel."""
 YAML = (".yaml", ".yml")
+MOST_PIXELS = 100_000
+"""Most rows or columns of an image."""
+
+
+class CameraEntries(TypedDict):
+    """Schema of a camera's description."""
+
+    width: Annotated[int, Meta(ge=1, le=MOST_PIXELS)]
+    height: Annotated[int, Meta(ge=1, le=MOST_PIXELS)]
+    fx: Positive
+    fy: Positive
+    cx: Finite
+    cy: Finite
+    distortion: NotRequired[list[Finite]]
 
 
 @dataclass(frozen=True)
@@ -204,16 +220,14 @@ class PinholeCamera:
         fisheye = values.get("version") == FISHEYE_VERSION
         if values.get("version") != VERSION and not fisheye:
             raise PerceptionError(
-                f"{name} has format version {values.get('version')}, this one reads {VERSION} and {FISHEYE_VERSION}"
+                f"{name} has format version {shown(values.get('version'))}, this one reads {VERSION} and "
+                f"{FISHEYE_VERSION}"
             )
-        try:
-            distortion = tuple(float(value) for value in values.get("distortion", ()))
-            fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
-            return cls(int(values["width"]), int(values["height"]), fx, fy, cx, cy, distortion, fisheye)
-        except KeyError as error:
-            raise PerceptionError(f"{name} lacks {error}: write it by `foretrace calibrate`") from error
-        except (TypeError, ValueError) as error:
-            raise PerceptionError(f"{name} has a value that is no number ({error})") from error
+        remedy = "write it by `foretrace calibrate`"
+        found = conform(values, CameraEntries, name, PerceptionError, remedy)
+        fx, fy, cx, cy = (float(found[key]) for key in ("fx", "fy", "cx", "cy"))
+        distortion = tuple(map(float, found.get("distortion", ())))
+        return cls(found["width"], found["height"], fx, fy, cx, cy, distortion, fisheye)
 
     def save(self, path: str | Path, **more: Any) -> None:
         """Write the camera as JSON, with further values beside it."""
@@ -230,5 +244,6 @@ class PinholeCamera:
         if path.suffix.lower() in YAML:
             return cls(**read_camera_yaml(path))
         return cls.from_dict(
-            read_json(path, PerceptionError, "make one with `foretrace calibrate`"), str(path)
+            read_json(path, dict[str, Any], PerceptionError, "make one with `foretrace calibrate`"),
+            str(path),
         )

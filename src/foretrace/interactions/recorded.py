@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 from foretrace.errors import DatasetError
 from foretrace.files import (
@@ -19,23 +19,33 @@ from foretrace.files import (
 )
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
+from foretrace.schema import Finite, Transform
 
 CONFIGURATION = {"source": "recorded"}
 OBJECTS = "objects"
 """Entry of the manifest with the number of each object, by the hash of its description."""
 NOTES_FOLDER = "recordings"
 """Folder with a JSON file for each interaction: its camera, and how well it was seen."""
-NOTED = {
-    "recording": str,
-    "camera": dict,
-    "T_action_camera": list,
-    "start": (int, float),
-    "frame_times": list,
-}
-"""What those files hold at least."""
 
 
-def read_notes(folder: Path, id: int) -> dict[str, Any]:
+class Notes(TypedDict):
+    """Schema of those files: what they hold at least."""
+
+    recording: str
+    """Path of the recording, seen from the data set."""
+    recording_path: NotRequired[str]
+    """Its absolute path."""
+    camera: dict[str, Any]
+    """Its camera."""
+    T_action_camera: Transform
+    """Pose of the camera in the action frame."""
+    start: Finite
+    """Time stamp at which the action starts [s]."""
+    frame_times: list[Finite]
+    """Time stamp of each frame [s]."""
+
+
+def read_notes(folder: Path, id: int) -> Notes:
     """What is kept beside a recorded interaction.
 
     Raises:
@@ -44,11 +54,7 @@ def read_notes(folder: Path, id: int) -> dict[str, Any]:
     path = folder / NOTES_FOLDER / f"{id:05d}.json"
     if not path.is_file():
         raise DatasetError(f"{folder} has no recording {id}: give a data set that `foretrace import` made")
-    notes = read_json(path, DatasetError, "import the recording again")
-    for name, kind in NOTED.items():
-        if not isinstance(notes.get(name), kind):
-            raise DatasetError(f"{path} lacks {name}: import the recording again")
-    return notes
+    return read_json(path, Notes, DatasetError, "import the recording again")
 
 
 def place_of(recording: Path, folder: Path) -> dict[str, str]:

@@ -9,14 +9,17 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, NotRequired, TypedDict
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from msgspec import Meta
 
 from foretrace import images
 from foretrace.errors import PerceptionError
 from foretrace.files import atomic_path, read_json, write_json
+from foretrace.schema import Finite
 
 TIMES = "timestamps.csv"
 COLUMNS = ("time_s", "colour", "depth")
@@ -44,6 +47,13 @@ class Frame:
     """Distance along the optical axis, pixel by pixel of the colour image [m]; 0: nothing seen."""
 
 
+class Notes(TypedDict):
+    """Schema of the notes."""
+
+    depth_unit: Annotated[float, Meta(gt=0, le=1)]
+    action_start: NotRequired[Finite | None]
+
+
 @dataclass(frozen=True)
 class RecordingNotes:
     """Unit of the depth images and start of the action."""
@@ -63,12 +73,8 @@ class RecordingNotes:
         path = folder / NOTES
         if not path.is_file():
             return cls()
-        values = read_json(path, PerceptionError, "give depth_unit in metres")
-        try:
-            start = values.get("action_start")
-            return cls(float(values["depth_unit"]), None if start is None else float(start))
-        except (ValueError, KeyError, TypeError) as error:
-            raise PerceptionError(f"{path} cannot be read ({error!r}): give depth_unit in metres") from error
+        values = read_json(path, Notes, PerceptionError, "give depth_unit in metres")
+        return cls(values["depth_unit"], values.get("action_start"))
 
     def save(self, folder: Path) -> None:
         """Write the notes into a folder."""

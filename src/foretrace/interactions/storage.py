@@ -10,18 +10,20 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from msgspec import Meta
 
 from foretrace.actions import FAILED, Action
 from foretrace.errors import DatasetError
 from foretrace.files import read_versioned, write_bytes, write_json
 from foretrace.interactions.record import Effect, ExecutionOffset, Interaction, Physics, Provenance
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
-from foretrace.objects import ObjectModel, object_from_dict
+from foretrace.objects import ObjectModel, object_from_json
+from foretrace.schema import MOST, Count, Finite, Vector2, parse_json
 
 FORMAT = "foretrace-interactions"
 FORMAT_VERSION = 2
@@ -29,6 +31,43 @@ MANIFEST = "manifest.json"
 SHARD_FOLDER = "shards"
 HEIGHT_STEP = 1e-4
 """Resolution of stored height maps [m]."""
+
+MOST_SHARDS = 1_000_000
+"""A data set that asks for more shards is a mistake."""
+
+
+class Configuration(TypedDict, total=False):
+    """What shapes the rows of a data set, as far as it is read back."""
+
+    randomisation: dict[str, Finite | Vector2 | None] | None
+    """Range of each quantity that is drawn anew, or how far it may be off."""
+    path: dict[str, Finite]
+    """Parameters of the tool's path."""
+    simulation: dict[str, Any]
+    """How each action was simulated."""
+
+
+class ShardEntry(TypedDict, total=False):
+    """What the manifest says about a shard."""
+
+    sha256: str | None
+    """Checksum; missing after an interrupted run."""
+    rows: Count
+    """Number of rows."""
+
+
+class Manifest(TypedDict):
+    """Schema of the manifest."""
+
+    format_version: int
+    configuration: Configuration
+    num_trials: Count
+    shard_size: Annotated[int, Meta(ge=1, le=MOST)]
+    versions: dict[str, str]
+    shards: dict[Annotated[str, Meta(pattern=rf"^{SHARD_FOLDER}/shard-\d{{5,}}\.parquet$")], ShardEntry]
+    objects: NotRequired[dict[str, Count]]
+    """Number of each object of a data set of recordings, by the hash of its description."""
+
 
 _FLOATS = pa.list_(pa.float64())
 COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
@@ -150,7 +189,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
         path_error=row["path_error"],
     )
     return Interaction(
-        object=known_object if known_object is not None else object_from_dict(json.loads(row["object"])),
+        object=known_object if known_object is not None else object_from_json(row["object"]),
         action=decode_action(row),
         view=TopDownView(
             mask=unpack_masks([row["mask"]])[0],
@@ -160,7 +199,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
         effect=effect,
         physics=Physics(**{name: row[name] for name in PHYSICS_COLUMNS}),
         provenance=Provenance(
-            **{name: row[name] for name in PROVENANCE_COLUMNS}, versions=json.loads(row["versions"])
+            **{name: row[name] for name in PROVENANCE_COLUMNS}, versions=parse_json(row["versions"])
         ),
         execution_error=ExecutionOffset(**{f.name: row[EXECUTION + f.name] for f in fields(ExecutionOffset)}),
         id=row["id"],
@@ -170,7 +209,7 @@ def decode(row: Mapping[str, Any], known_object: ObjectModel | None = None) -> I
 def decode_action(row: Mapping[str, Any]) -> Action:
     """The commanded action in one row."""
     place = {name: row[name] for name in ("contact", "direction")}
-    settings = {name: json.loads(row[name]) for name in ("path", "tool")}
+    settings = {name: parse_json(row[name]) for name in ("path", "tool")}
     return Action.from_dict({"label": row["action"], **place, **settings})
 
 
@@ -318,22 +357,18 @@ def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
     if not path.is_file():
         raise DatasetError(f"{folder} is not a data set: it has no {MANIFEST}; {remedy}")
     remedy = "simulate again into a new folder"
-    manifest = read_versioned(path, FORMAT, FORMAT_VERSION, DatasetError, remedy, older=(1,))
+    manifest = read_versioned(path, Manifest, FORMAT, FORMAT_VERSION, DatasetError, remedy, older=(1,))
     if manifest["format_version"] not in (FORMAT_VERSION, *older):
         raise DatasetError(
             f"{path} has format version {manifest['format_version']}, this foretrace reads version {FORMAT_VERSION}: "
             f"upgrade it in place with `foretrace data {folder} --upgrade`"
         )
-    for name, kind in (("shards", dict), ("configuration", dict), ("num_trials", int), ("shard_size", int)):
-        if not isinstance(manifest.get(name), kind):
-            raise DatasetError(f"{path} is damaged (its {name} is {manifest.get(name)!r}); {remedy}")
-    for name, least in (("num_trials", 0), ("shard_size", 1)):
-        if manifest[name] < least:
-            raise DatasetError(f"{path} is damaged (its {name} is {manifest[name]}); {remedy}")
-    for name, entry in manifest["shards"].items():
-        if not isinstance(entry, dict) or not isinstance(entry.get("sha256"), str | type(None)):
-            raise DatasetError(f"{path} is damaged (its entry of {name} is {entry!r}); {remedy}")
-    return manifest
+    if manifest["num_trials"] > MOST_SHARDS * manifest["shard_size"]:
+        raise DatasetError(
+            f"{path}: num_trials {manifest['num_trials']} in shards of {manifest['shard_size']} are more than "
+            f"{MOST_SHARDS} shards: {remedy}"
+        )
+    return dict(manifest)
 
 
 def missing_shards(manifest: Mapping[str, Any]) -> list[str]:

@@ -19,6 +19,7 @@ from foretrace.objects.model import (
     MassProperties,
     ObjectModel,
     object_from_dict,
+    object_from_json,
 )
 from foretrace.objects.prism import CIRCLE_RADIUS, CORNER_COUNTS, Prism, paper_objects, sample_prism
 from foretrace.objects.silhouette import read_silhouette, silhouette_origin
@@ -49,6 +50,7 @@ __all__ = [
     "Prism",
     "look_alikes",
     "object_from_dict",
+    "object_from_json",
     "paper_objects",
     "read_silhouette",
     "sample_box",

@@ -12,9 +12,10 @@ import shapely
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from foretrace.errors import ShapeError, is_number
+from foretrace.errors import ForetraceError, ShapeError, check_type, is_number, shown
 from foretrace.geometry import convex_hull
 from foretrace.registry import Registry
+from foretrace.schema import parse_json
 
 SIZE_LIMITS = (0.01, 1.0)
 """Smallest and largest believable length of an object [m]: anything else is a wrong unit or scale."""
@@ -167,12 +168,28 @@ def object_from_dict(values: Mapping[str, Any]) -> ObjectModel:
     Raises:
         ShapeError: If the kind is unknown, a value is missing or the geometry is not usable.
     """
+    check_type("description of an object", values, Mapping, ShapeError, "a dictionary, as of to_dict")
     family = OBJECTS.find(values.get("kind"))
     try:
         return family.from_dict(values)
-    except (KeyError, TypeError, ValueError) as error:
-        reason = f"is not usable ({error!r}): write it with to_dict"
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        if isinstance(error, ForetraceError):
+            raise
+        reason = f"is not usable ({shown(error)}): write it with to_dict"
         raise ShapeError(f"description of a {family.kind} {reason}") from error
+
+
+def object_from_json(text: str) -> ObjectModel:
+    """The object of ``object_from_dict`` whose description is a JSON text.
+
+    Raises:
+        ShapeError: If it is none, or describes no usable object.
+    """
+    try:
+        values = parse_json(text)
+    except ValueError as reason:
+        raise ShapeError(f"description of an object is no JSON ({reason}): write it with to_dict") from None
+    return object_from_dict(values)
 
 
 def _plain(value: Any) -> Any:

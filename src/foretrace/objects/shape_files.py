@@ -1,6 +1,7 @@
 """Objects and outlines from files: corners as text, meshes, descriptions, images of silhouettes."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ def read_shape(path: Path, height: float | None = None) -> ObjectModel:
     if path.suffix.lower() in (".stl", ".obj"):
         return MeshObject.load(path)
     if path.suffix.lower() == ".json":
-        content = read_json(path, ShapeError, "give an object's to_dict() as JSON")
+        content = read_json(path, dict[str, Any], ShapeError, "give an object's to_dict() as JSON")
         if "type" not in content:  # GeoJSON names its type, an object its kind
             return object_from_dict(content)
     return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)

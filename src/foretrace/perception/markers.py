@@ -5,21 +5,23 @@ A marker's frame has its origin in the marker's middle, x to the right and y up 
 them apart.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, NotRequired, Required, TypedDict
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
+from msgspec import Meta
 
 from foretrace.errors import PerceptionError
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, planar_transform, rigid_transform, transform_points
 from foretrace.interactions.marker_patterns import DICTIONARIES, dictionary
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.schema import Count, Finite
 
 FORMAT = "foretrace-markers"
 VERSION = 1
@@ -285,6 +287,33 @@ def to_transform(rvec: np.ndarray, tvec: np.ndarray) -> Float[np.ndarray, "4 4"]
     return rigid_transform(cv2.Rodrigues(np.asarray(rvec, dtype=float))[0], np.ravel(tvec))
 
 
+class Placement(TypedDict, total=False):
+    """Schema of a place in the plane of a body."""
+
+    position: Annotated[list[Finite], Meta(min_length=2, max_length=3)]
+    """Where it is [m]; in the origin by default."""
+    angle_deg: Finite
+    """Angle about z [degree]; 0 by default."""
+
+
+class MarkerEntries(Placement):
+    """Schema of a marker in a layout."""
+
+    id: Required[Count]
+    """Its number in the dictionary."""
+    side: Required[Annotated[float, Meta(ge=0.001, le=1)]]
+    """Length of its sides [m]."""
+
+
+class LayoutEntries(TypedDict):
+    """Schema of a layout."""
+
+    dictionary: str
+    table: Annotated[list[MarkerEntries], Meta(min_length=1)]
+    object: Annotated[list[MarkerEntries], Meta(min_length=1)]
+    object_pose: NotRequired[Placement]
+
+
 @dataclass(frozen=True)
 class MarkerLayout:
     """Which markers are used, on the table and on the object."""
@@ -306,15 +335,15 @@ class MarkerLayout:
             PerceptionError: The file is missing or is no such layout.
         """
         remedy = "give a marker layout with its dictionary, table and object"
-        values = read_versioned(Path(path), FORMAT, VERSION, PerceptionError, remedy, key="version")
+        values = read_versioned(
+            Path(path), LayoutEntries, FORMAT, VERSION, PerceptionError, remedy, key="version"
+        )
         try:
-            bodies = {name: _read_body(values[name]) for name in ("table", "object")}
-            pose = _placement(values["object_pose"]) if "object_pose" in values else None
-            layout = cls(str(values["dictionary"]), bodies["table"], bodies["object"], pose)
-        except (KeyError, TypeError, ValueError) as error:
-            raise PerceptionError(
-                f"{path}: {error!r}: give dictionary, table and object, each marker with id and side [m]"
-            ) from error
+            table, body = (_read_body(values[name]) for name in ("table", "object"))
+        except ValueError as error:
+            raise PerceptionError(f"{path}: {error}: {remedy}, each marker with id and side [m]") from error
+        pose = _placement(values["object_pose"]) if "object_pose" in values else None
+        layout = cls(values["dictionary"], table, body, pose)
         size = dictionary(layout.dictionary).bytesList.shape[0]
         ids = layout.table.ids + layout.object.ids
         if len(set(ids)) < len(ids) or not all(0 <= id < size for id in ids):
@@ -322,14 +351,13 @@ class MarkerLayout:
         return layout
 
 
-def _read_body(entries: list[dict[str, Any]]) -> MarkerBody:
-    sides = {int(entry["id"]): float(entry["side"]) for entry in entries}
-    if not sides or len(sides) < len(entries) or not all(0.001 <= side <= 1 for side in sides.values()):
-        raise ValueError(f"markers {entries}: ids must differ, sides lie between 0.001 and 1 m")
-    return MarkerBody(sides, {int(entry["id"]): _placement(entry) for entry in entries})
+def _read_body(entries: Sequence[MarkerEntries]) -> MarkerBody:
+    sides = {entry["id"]: float(entry["side"]) for entry in entries}
+    if len(sides) < len(entries):
+        raise ValueError(f"markers {[entry['id'] for entry in entries]}: ids must differ")
+    return MarkerBody(sides, {entry["id"]: _placement(entry) for entry in entries})
 
 
-def _placement(entry: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
+def _placement(entry: Placement) -> Float[np.ndarray, "4 4"]:
     """T_body_marker of a marker that lies flat: position [m] and angle about z [degree]."""
-    position = [float(value) for value in entry.get("position", ())]
-    return planar_transform(position, np.deg2rad(float(entry.get("angle_deg", 0.0))))
+    return planar_transform(entry.get("position", ()), np.deg2rad(entry.get("angle_deg", 0.0)))

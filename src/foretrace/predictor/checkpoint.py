@@ -4,19 +4,21 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import torch
+from msgspec import Meta
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from foretrace.errors import CheckpointError, TrainingError
+from foretrace.errors import CheckpointError, TrainingError, shown
 from foretrace.files import as_json, as_path, make_folder, read_versioned, write_bytes, write_json
-from foretrace.imagined.domain import read_ranges
+from foretrace.imagined.domain import known_ranges
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.base import PREDICTORS, EffectPredictor
 from foretrace.predictor.config import TrainConfig, check_outcomes
+from foretrace.schema import Vector2, conform
 
 FORMAT = "foretrace-predictor"
 FORMAT_VERSION = 2
@@ -26,6 +28,37 @@ DEFAULT = "default"
 """Folder of the predictor that comes with the package."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
+
+
+class PredictorEntries(TypedDict):
+    """Schema of ``config.json``."""
+
+    predictor: str
+    config: dict[str, Any]
+    num_samples: Annotated[int, Meta(ge=2, le=1_000_000)]
+    outcomes: list[str]
+    ranges: NotRequired[dict[str, Vector2]]
+    training: NotRequired[dict[str, Any]]
+
+
+class OldFeatures(TypedDict):
+    """Schema of the features in version 1."""
+
+    label: str
+    options: dict[str, Any]
+
+
+class OldEntries(TypedDict):
+    """Schema of version 1."""
+
+    predictor: str
+    settings: dict[str, Any]
+    features: OldFeatures
+    num_samples: int
+    ranges: NotRequired[dict[str, Vector2]]
+    training: NotRequired[dict[str, Any]]
+
+
 RENAMED = {"known": "context", "members": "ensemble", "motions": "components", "hinges": "pivot_edges"}
 """Settings of version 1 by their names in version 2."""
 
@@ -98,7 +131,7 @@ def load_predictor(path: str | Path | None = None) -> EffectPredictor:
     return predictor.eval()
 
 
-def read_config(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> PredictorEntries:
     """The contents of a checkpoint's ``config.json``, in the form of `FORMAT_VERSION`.
 
     Raises:
@@ -106,26 +139,25 @@ def read_config(path: Path) -> dict[str, Any]:
     """
     file = path / CONFIG
     remedy = "give the folder of a trained predictor, copy it again or train anew"
-    config = read_versioned(file, FORMAT, FORMAT_VERSION, CheckpointError, remedy, key="version", older=(1,))
-    if config["version"] == FORMAT_VERSION:
-        return config
-    try:
-        return _upgrade(config)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{file} is incomplete ({error!r}): {remedy}") from error
+    config = read_versioned(
+        file, dict[str, Any], FORMAT, FORMAT_VERSION, CheckpointError, remedy, key="version", older=(1,)
+    )
+    if config["version"] != FORMAT_VERSION:
+        config = _upgrade(conform(config, OldEntries, str(file), CheckpointError, remedy))
+    return conform(config, PredictorEntries, str(file), CheckpointError, remedy)
 
 
-def _upgrade(old: Mapping[str, Any]) -> dict[str, Any]:
+def _upgrade(old: OldEntries) -> dict[str, Any]:
     """A configuration of version 1 as one of version 2."""
     settings = {RENAMED.get(name, name): value for name, value in old["settings"].items()}
-    features, training = old["features"], dict(old.get("training", {}))
+    features, training = old["features"], old.get("training", {})
     loop = [*(field.name for field in fields(TrainConfig)), "data", "rows"]
     config = {"features": features["label"], "feature_options": features["options"], "context": []} | settings
     return {
         **{"format": FORMAT, "version": FORMAT_VERSION, "predictor": old["predictor"], "config": config},
         "num_samples": old["num_samples"],
         "outcomes": training.get("outcomes", settings.get("outcomes", [str(Outcome.LEVERED)])),
-        **({RANGES: old[RANGES]} if RANGES in old else {}),
+        **({"ranges": old["ranges"]} if "ranges" in old else {}),
         "training": {name: training[name] for name in loop if name in training},
     }
 
@@ -154,9 +186,9 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -
     """Fill a module's parameters and buffers, all of them and no others.
 
     Raises:
-        CheckpointError: A tensor is missing, unexpected, or of another shape or type.
+        CheckpointError: A tensor is missing, unexpected, of another shape or type, or holds what is no number.
     """
-    expected = module.state_dict()
+    expected, weights = module.state_dict(), dict(module.named_parameters())
     advice = f"it does not belong to its {CONFIG}"
     if missing := sorted(expected.keys() - tensors.keys()):
         raise CheckpointError(f"{file} lacks the tensors {', '.join(missing)}: {advice}")
@@ -169,23 +201,30 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -
                 f"{file}: {name} is {tuple(tensor.shape)} {tensor.dtype}, its {CONFIG} asks for "
                 f"{tuple(wanted.shape)} {wanted.dtype}"
             )
+        # What is no weight may be infinite, such as the radius of a region that holds everything.
+        if (tensor if name not in weights else tensor - tensor).isnan().any():
+            raise CheckpointError(f"{file}: {name} holds NaN or infinity: copy it again or train anew")
     module.load_state_dict(dict(tensors))
 
 
-def _make(content: Mapping[str, Any], file: Path) -> EffectPredictor:
+def _make(content: PredictorEntries, file: Path) -> EffectPredictor:
     """The predictor that a configuration describes, untrained."""
+    settings = content["config"]
     try:
         config_class = PREDICTORS.find(content["predictor"]).config_class
-        settings = content["config"]
         if odd := sorted({field.name for field in fields(config_class)} ^ settings.keys()):
             raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
-        tuples = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
+        tuples: dict[str, Any] = {
+            name: tuple(value) for name, value in settings.items() if isinstance(value, list)
+        }
         predictor = config_class(**settings | tuples).make(content["num_samples"])
         check_outcomes(content["outcomes"])
         predictor.learned_from = tuple(content["outcomes"])
-        predictor.ranges = read_ranges(content.get(RANGES))
+        predictor.ranges = known_ranges(content.get("ranges", {}))
         return predictor
     except TrainingError as error:
         raise CheckpointError(f"{file}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(f"{file} is incomplete ({error!r}): copy it again or train anew") from error
+        raise CheckpointError(
+            f"{file}: its config cannot be used ({shown(error)}): copy it again or train anew"
+        ) from error

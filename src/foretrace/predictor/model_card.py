@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -14,11 +14,21 @@ from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
 from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
-from foretrace.predictor.checkpoint import read_config
+from foretrace.predictor.checkpoint import CONFIG, read_config
 from foretrace.predictor.config import feature_option
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
+
+
+class Environment(TypedDict):
+    """Schema of what is noted about the run."""
+
+    commit: str | None
+    device: str
+    precision: str
+    versions: dict[str, str]
+
 
 PARTS = ("train", "validation", "test")
 SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
@@ -92,11 +102,15 @@ def _data(
 
 def _training(run: Path, data: Path) -> str:
     content, predictor = read_config(run), load_predictor(run)
+    training = content.get("training", {})
+    if "data" not in training:
+        raise TrainingError(
+            f"{run / CONFIG} does not say how it was trained: give the whole folder of a training"
+        )
     nominal = as_json(asdict(type(predictor.config)()))
     options = {name: value for name, value in content["config"].items() if value != nominal.get(name)}
     given = options.pop("feature_options", {})
     options |= {feature_option(name, type(predictor.config)): value for name, value in given.items()}
-    training = content["training"]
     options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
     command = [f"foretrace train --data {data} --out {run} --predictor {predictor.label}"]
     for name, value in options.items():
@@ -105,7 +119,8 @@ def _training(run: Path, data: Path) -> str:
         values = [] if isinstance(value, bool) else value if isinstance(value, list) else [value]
         option = f"--{'no-' if value is False else ''}{name.replace('_', '-')}"
         command.append(" ".join([option, *map(str, values)]))
-    environment = read_json(run / ENVIRONMENT, TrainingError, "give the whole folder of a training")
+    remedy = "give the whole folder of a training"
+    environment = read_json(run / ENVIRONMENT, Environment, TrainingError, remedy)
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return (
         f"```console\n$ {' '.join(command)}\n```\n\nCommit {environment['commit'] or 'unknown'}; {versions}; on "

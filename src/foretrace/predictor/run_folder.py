@@ -9,14 +9,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 import torch
+from msgspec import Meta
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from foretrace.errors import DatasetError, TrainingError
+from foretrace.errors import DatasetError, TrainingError, shown
 from foretrace.files import (
     as_json,
     first_difference,
@@ -44,6 +45,7 @@ from foretrace.predictor.checkpoint import (
     read_tensors,
     write_tensors,
 )
+from foretrace.schema import Count, conform, parse_json
 
 ENVIRONMENT = "environment.json"
 METRICS = "metrics.csv"
@@ -52,6 +54,22 @@ FINGERPRINTS = "fingerprints"
 """Entry of the split with a fingerprint of each part."""
 RESUME = "resume.safetensors"
 TENSORBOARD = "tensorboard"
+
+
+class RunSettings(TypedDict, total=False):
+    """Schema of the environment, as far as a training reads it back."""
+
+    threads: Annotated[int, Meta(ge=1, le=1024)]
+
+
+class SplitEntries(TypedDict):
+    """Schema of the split."""
+
+    train: list[Count]
+    validation: list[Count]
+    test: list[Count]
+    fingerprints: NotRequired[dict[str, str]]
+
 
 Source = InteractionBatch | Dataset
 """Interactions in memory or on disk."""
@@ -65,7 +83,7 @@ class Progress:
 
     history: list[Row] = field(default_factory=list)
     """One row of metrics per finished epoch."""
-    best_epoch: int = 0
+    best_epoch: Count = 0
     """The epoch whose model is kept, counted from 1; 0 before there is one."""
 
     @property
@@ -149,10 +167,9 @@ class RunFolder:
     def threads(self) -> int | None:
         """Threads that the training in the folder runs with; None: not known."""
         try:
-            threads = read_json(self.path / ENVIRONMENT, TrainingError, "").get("threads")
+            return read_json(self.path / ENVIRONMENT, RunSettings, TrainingError, "").get("threads")
         except TrainingError:
             return None
-        return threads if isinstance(threads, int) and threads > 0 else None
 
     def write_environment(self, facts: Mapping[str, Any]) -> None:
         """Note what the training runs on."""
@@ -191,22 +208,27 @@ class RunFolder:
             TrainingError: The file is damaged.
             CheckpointError: Its tensors do not fit.
         """
-        file = self.path / RESUME
+        file, remedy = self.path / RESUME, "train anew without resuming"
         if not file.is_file():
             return None
         try:
             with safe_open(file, framework="pt") as opened:
                 tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-                progress = Progress(**json.loads(opened.metadata()["progress"]))
-        except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
-            raise TrainingError(f"{file} cannot be read ({error}): train anew without resuming") from error
+                content = parse_json((opened.metadata() or {})["progress"])
+        except (SafetensorError, OSError, KeyError, ValueError) as error:
+            raise TrainingError(f"{file} cannot be read ({shown(error)}): {remedy}") from error
+        progress = conform(content, Progress, str(file), TrainingError, remedy, "progress")
+        if progress.best_epoch > progress.epoch:
+            raise TrainingError(f"{file}: best_epoch {progress.best_epoch} of {progress.epoch}: {remedy}")
         if progress.best_epoch and not (self.path / MODEL).is_file():
             return None
         load_tensors(predictor, _below("model.", tensors), file)
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in _below("optimizer.", tensors).items():
-            index, key = name.split(".")
+            index, _, key = name.partition(".")
+            if not index.isdecimal() or int(index) >= len(parameters):
+                raise TrainingError(f"{file} has an unexpected tensor optimizer.{name:.80}: {remedy}")
             parameter = parameters[int(index)]
             if tensor.shape == parameter.shape:
                 # The fused optimiser pairs numbers by their place in memory: give them the parameter's layout.
@@ -268,9 +290,7 @@ def parts_of(run: str | Path, data: Dataset) -> dict[str, list[int]]:
         data: All of the data set.
     """
     try:
-        return {
-            name: _rows_of(run, data, name).ids.tolist() for name in _read_split(run) if name != FINGERPRINTS
-        }
+        return {name: _rows_of(run, data, name).ids.tolist() for name in _read_split(run)[0]}
     except (DatasetError, TrainingError):
         return {}
 
@@ -292,8 +312,7 @@ def part_of(run: str | Path, data: Source, part: str = "test") -> InteractionBat
 
 def _rows_of(run: str | Path, data: Source, part: str) -> Source:
     """The interactions that were one part of a training's split, and are still the same."""
-    parts = _read_split(run)
-    prints = parts.pop(FINGERPRINTS, {})
+    parts, prints = _read_split(run)
     if part not in parts or part not in prints:
         raise TrainingError(f"{Path(run) / SPLIT} has no part {part!r}; it has: {', '.join(parts)}")
     rows = np.flatnonzero(np.isin(data.ids, parts[part]))
@@ -312,8 +331,11 @@ def _rows_of(run: str | Path, data: Source, part: str) -> Source:
     return found
 
 
-def _read_split(run: str | Path) -> dict[str, Any]:
-    return read_json(Path(run) / SPLIT, TrainingError, "give the folder of a training")
+def _read_split(run: str | Path) -> tuple[dict[str, list[int]], dict[str, str]]:
+    """Ids of the interactions in each part, and the fingerprints of the parts."""
+    content = read_json(Path(run) / SPLIT, SplitEntries, TrainingError, "give the folder of a training")
+    parts = {"train": content["train"], "validation": content["validation"], "test": content["test"]}
+    return parts, content.get("fingerprints", {})
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -3,17 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, TypedDict
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta
 from scipy.interpolate import CubicSpline
 
 from foretrace.actions import LeverUp, tool_transforms
-from foretrace.errors import RobotError, is_number
+from foretrace.errors import RobotError, is_number, shown
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, pose_to_matrix
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.simulation import arm
+from foretrace.trajectories import UNIT_TOLERANCE
 
 KNOT_PERIOD = 0.04
 """Inverse kinematics is solved at these intervals of the unscaled path; a cubic spline joins the solutions [s]."""
@@ -30,6 +33,16 @@ FARTHEST_BASE = 10.0
 LEVER_UP = "lever-up"
 """Name of the leg that is the tool path."""
 FILE_FORMAT, FILE_VERSION = "foretrace-base-pose", 1
+
+
+class BasePose(TypedDict):
+    """Schema of the file with the pose of the arm's base."""
+
+    # Within bounds before anything is squared.
+    T_table_base: Annotated[
+        list[Annotated[float, Meta(ge=-FARTHEST_BASE, le=FARTHEST_BASE)]], Meta(min_length=7, max_length=7)
+    ]
+    """Position [m] and unit quaternion (w, x, y, z)."""
 
 
 @dataclass(frozen=True)
@@ -53,22 +66,13 @@ def read_base_pose(file: Path) -> Float[np.ndarray, "4 4"]:
     Raises:
         RobotError: If the file cannot be read, or is not such a pose.
     """
-    remedy = "give a JSON file with T_table_base"
-    content = read_versioned(file, FILE_FORMAT, FILE_VERSION, RobotError, remedy, key="version")
-    given = content.get("T_table_base")
-    # Within bounds before anything is squared.
-    if (
-        isinstance(given, list)
-        and len(given) == 7
-        and all(is_number(value) and abs(value) <= FARTHEST_BASE for value in given)
-    ):
-        pose = np.array(given, dtype=float)
-        if abs(np.linalg.norm(pose[3:]) - 1) <= 1e-3:
-            return pose_to_matrix(pose)
-    raise RobotError(
-        f"{file}: T_table_base = {str(given)[:80]}: expected x y z [m], at most {FARTHEST_BASE:g} m away, and a unit "
-        "quaternion w x y z"
-    )
+    place = f"x y z [m], at most {FARTHEST_BASE:g} m away, and a unit quaternion w x y z"
+    remedy = f"give a JSON file with T_table_base: {place}"
+    content = read_versioned(file, BasePose, FILE_FORMAT, FILE_VERSION, RobotError, remedy, key="version")
+    pose = np.array(content["T_table_base"], dtype=float)
+    if abs(np.linalg.norm(pose[3:]) - 1) > UNIT_TOLERANCE:
+        raise RobotError(f"{file}: entry T_table_base is {shown(pose.tolist())}: {remedy}")
+    return pose_to_matrix(pose)
 
 
 def plan_lever_up(
