@@ -29,7 +29,8 @@ from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, sample_prism
-from foretrace.perception.calibration import Board, calibrate, read_images
+from foretrace.perception.board import Board
+from foretrace.perception.calibration import calibrate, read_images
 from foretrace.perception.importing import ONSET_SHIFT, Contact, Imported, import_recording
 from foretrace.perception.markers import MarkerLayout, detect_markers
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay

@@ -6,7 +6,7 @@ import numpy as np
 from foretrace.geometry import invert_transform
 from foretrace.interactions.marker_patterns import draw_marker
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.calibration import Board
+from foretrace.perception.board import Board
 
 CAMERA = PinholeCamera(640, 480, 600.0, 604.0, 322.0, 236.0, (0.08, -0.15, 0.001, -0.001, 0.05))
 BOARD = Board((6, 5), 0.03, 0.022, "4x4_50")

@@ -14,7 +14,8 @@ from foretrace.cli import main
 from foretrace.errors import PerceptionError
 from foretrace.geometry import invert_transform, pose_to_matrix, rotation_angle
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.calibration import Board, calibrate, refine_camera
+from foretrace.perception.board import Board
+from foretrace.perception.calibration import calibrate, refine_camera
 from foretrace.perception.markers import (
     Detections,
     MarkerBody,

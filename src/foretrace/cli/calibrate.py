@@ -8,8 +8,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from foretrace.cli.console import say
 from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.calibration import Board, read_images, refine_camera
+from foretrace.perception.board import Board
 from foretrace.perception.calibration import calibrate as calibrate_camera
+from foretrace.perception.calibration import read_images, refine_camera
 from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
 
 
@@ -64,11 +65,16 @@ def calibrate(
         print(f"{name}: {error:.3f} pixels")
     for name, reason in found.left_out.items():
         say(f"left out: {name} {reason}")
-    found.camera.save(out, error_pixels=found.error, images=len(found.errors))
-    camera = found.camera
-    print(
-        f"focal lengths {camera.fx:.1f} and {camera.fy:.1f}, centre {camera.cx:.1f}, {camera.cy:.1f} pixels"
+    for note in found.notes:
+        say(note)
+    deviations = found.deviations
+    found.camera.save(
+        out, error_pixels=found.error, images=len(found.errors), standard_deviations_pixels=deviations
     )
+    values = (
+        f"{getattr(found.camera, name):.1f} ± {deviations[name]:.1f}" for name in ("fx", "fy", "cx", "cy")
+    )
+    print("focal lengths {} and {}, centre {}, {} pixels".format(*values))
     print(f"error {found.error:.3f} pixels over {len(found.errors)} images")
     print(out)
 

@@ -16,7 +16,7 @@ from foretrace.geometry import invert_transform
 from foretrace.interactions import recording_folder
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.calibration import Board
+from foretrace.perception.board import Board
 from foretrace.simulation.lens import WEBCAM
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.recording import RecordingConfig, photograph_board, record_lever_up

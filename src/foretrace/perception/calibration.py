@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -10,135 +9,36 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foretrace.errors import PerceptionError
-from foretrace.geometry import invert_transform
-from foretrace.interactions.marker_patterns import dictionary
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
-from foretrace.perception.markers import Detections, MarkerBody, grey, image_fault, to_transform
+from foretrace.perception.board import FEWEST_CORNERS, Board, recognise, spans_plane
+from foretrace.perception.camera_fit import BoardViews, choose_lens, deviations_of, straighten
+from foretrace.perception.markers import Detections, MarkerBody, image_fault
 
 FEWEST_IMAGES = 5
 """Least number of images that show the board."""
-FEWEST_CORNERS = 8
-"""Least number of inner corners of the board in an image that counts."""
+ENOUGH_IMAGES = 10
+"""With fewer, more are advised where a calibration is too uncertain."""
+ALIKE = 0.005
+"""Views whose corners are closer than this on average count as one [image width]."""
 LARGEST_ERROR = 1.0
 """Largest reprojection error of a calibration [pixel]."""
-LOOSEST_FOCUS = 0.02
-"""Largest relative standard deviation of a refined focal length."""
+LOOSEST = 0.02
+"""Largest standard deviation of focal length, centre and border of a calibration [focal length]."""
 FARTHEST_FOCUS = 0.2
 """Largest relative change of a refined focal length."""
-LEAST_TILT = np.deg2rad(10.0)
-"""Least slant of the board in one of the images; without it the focal length stays unknown [rad]."""
-PAPER = 0.015
-"""White margin round a printed board [m]; with it, the default board fits A4."""
-INCH = 0.0254
+LEAST_TILT, GOOD_TILT = np.deg2rad([10.0, 25.0])
+"""Least slant of the board in one of the images, without which the focal length stays unknown, and a good one [rad]."""
+LEAST_FILL = 0.35
+"""Least part of the image's width or height that the board should fill in some images."""
+LEAST_COVER = 0.6
+"""Least part of the image's width and height over which the board should have been."""
+LEAST_BEND = 0.0002
+"""Least bend of a board that is told [m]."""
+LARGEST_RATIO = 0.05
+"""Largest relative error of a marker's stated side in its square that passes without a word."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Endings of image files."""
-
-
-@dataclass(frozen=True)
-class Board:
-    """A ChArUco board, as printed; its frame has its origin in a corner, z out of it.
-
-    Raises:
-        PerceptionError: The lengths or the number of squares make no board.
-    """
-
-    squares: tuple[int, int] = (7, 5)
-    """Squares along x and y."""
-    square_length: float = 0.035
-    """Side of a square [m]."""
-    marker_length: float = 0.026
-    """Side of a marker [m]."""
-    dictionary: str = "5x5_100"
-    """Dictionary of its markers."""
-
-    def __post_init__(self) -> None:
-        columns, rows = self.squares
-        if min(columns, rows) < 3:
-            raise PerceptionError(f"board of {columns} x {rows} squares: at least 3 x 3 are needed")
-        if not 0 < self.marker_length < self.square_length < 1:
-            raise PerceptionError(
-                f"board with markers of {self.marker_length} m in squares of {self.square_length} m: "
-                "the marker must be smaller than its square, both in metres"
-            )
-        size = dictionary(self.dictionary).bytesList.shape[0]
-        if columns * rows // 2 > size:
-            raise PerceptionError(
-                f"board of {columns} x {rows} squares needs {columns * rows // 2} markers, {self.dictionary} has {size}"
-            )
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Width and height [m]."""
-        return self.squares[0] * self.square_length, self.squares[1] * self.square_length
-
-    def draw(self, pixels_per_metre: float = 300 / INCH) -> UInt8[np.ndarray, "rows columns"]:
-        """The board as an image, without a margin; at 300 dots per inch by default."""
-        width, height = (round(length * pixels_per_metre) for length in self.size)
-        return self._board.generateImage((width, height), marginSize=0)
-
-    def save(self, path: str | Path) -> None:
-        """Write the board for printing at its true size, as PNG (300 dots per inch) or PDF.
-
-        Raises:
-            PerceptionError: The name ends in neither.
-        """
-        from PIL import Image
-
-        path = Path(path)
-        if path.suffix.lower() not in (".png", ".pdf"):
-            raise PerceptionError(f"cannot write a board to {path}: choose a name that ends in .png or .pdf")
-        margin = round(PAPER * 300 / INCH)
-        image = np.pad(self.draw(), margin, constant_values=255)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(image).save(path, dpi=(300, 300), resolution=300)
-
-    def find(
-        self, image: UInt8[np.ndarray, "rows columns *channels"]
-    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 2"]]:
-        """Inner corners of the board [m] and where they were seen [pixel]; no rows where it was not."""
-        corners, ids, _, _ = self._detector.detectBoard(grey(image))
-        if ids is None or len(ids) == 0:
-            return np.zeros((0, 3)), np.zeros((0, 2))
-        known = np.asarray(self._board.getChessboardCorners(), dtype=float).reshape(-1, 3)
-        # OpenCV's board has y downwards and z into it; ours has y upwards and z out of it.
-        known = known * [1.0, -1.0, 0.0] + [0.0, self.size[1], 0.0]
-        return known[np.ravel(ids).astype(int)], np.asarray(corners, dtype=float).reshape(-1, 2)
-
-    def pose(
-        self, image: UInt8[np.ndarray, "rows columns *channels"], camera: PinholeCamera, name: str = "image"
-    ) -> Float[np.ndarray, "4 4"]:
-        """T_board_camera: the camera's pose over a board that lies on the table, whose frame is the table frame.
-
-        Raises:
-            PerceptionError: The image is of another camera or does not show the board.
-        """
-        camera.check_image(image, name)
-        points, pixels = self.find(image)
-        if len(points) < FEWEST_CORNERS or not _spans_plane(points):
-            raise PerceptionError(f"{name} {self.what_is_missing(image)}")
-        pixels, coefficients = camera.for_opencv(pixels)
-        found, rvec, tvec = cv2.solvePnP(points, pixels, camera.matrix, coefficients, flags=cv2.SOLVEPNP_IPPE)
-        if not found:
-            raise PerceptionError(f"{name}: no pose explains the board's corners: show more of it")
-        rvec, tvec = cv2.solvePnPRefineLM(points, pixels, camera.matrix, coefficients, rvec, tvec)
-        return invert_transform(to_transform(rvec, tvec))
-
-    def what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
-        """Why an image does not show enough of the board, in words."""
-        found = f"shows {len(self.find(image)[0])} corners of the board"
-        if fault := image_fault(image, self.dictionary):
-            return f"{found}: {fault}"
-        return f"{found}, {FEWEST_CORNERS} over two rows are needed: show more of it, and check squares and dictionary"
-
-    @cached_property
-    def _board(self) -> cv2.aruco.CharucoBoard:
-        markers = dictionary(self.dictionary)
-        return cv2.aruco.CharucoBoard(self.squares, self.square_length, self.marker_length, markers)
-
-    @cached_property
-    def _detector(self) -> cv2.aruco.CharucoDetector:
-        return cv2.aruco.CharucoDetector(self._board)
 
 
 @dataclass(frozen=True)
@@ -151,53 +51,161 @@ class Calibration:
     """Root mean square of the reprojection error over all corners [pixel]."""
     errors: dict[str, float]
     """The same for each image that was used."""
+    deviations: dict[str, float]
+    """Standard deviations of fx, fy, cx and cy, and of a line of sight at the image's border [pixel]."""
     left_out: dict[str, str]
     """Images that were not used, and why."""
+    board: Board
+    """The board that the images show: as stated, but for first number, pattern or colours."""
+    notes: tuple[str, ...] = ()
+    """What the board turned out to be."""
 
 
 def calibrate(images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]], board: Board) -> Calibration:
     """Focal lengths, centre and distortion (k1, k2, p1, p2, k3) from images of a board (Zhang, 2000).
+
+    Distortion coefficients that the images do not determine are zero (Schwarz, 1978), and a board that is bent is
+    taken as it is. Standard deviations are the larger of those of the least squares, for which corners err
+    independently, and those of fits without some of the images, for which images do (jackknife; Quenouille, 1956).
 
     Args:
         images: Images by name, all of one size: the board from several sides, slanted, also in the corners.
         board: What they show.
 
     Raises:
-        PerceptionError: Too few images show the board, their sizes differ, none shows it slanted, or no camera
-            explains them.
+        PerceptionError: Too few images show the board, their sizes differ, none shows it slanted, no camera
+            explains them, or they leave the camera too uncertain.
     """
     points, pixels, left_out = _find_corners(images, board)
+    stated = board
+    if len(points) < FEWEST_IMAGES:
+        found, _ = recognise([images[name] for name in list(left_out)[:3]], board)
+        if found is not None and found != board:
+            board = found
+            points, pixels, left_out = _find_corners(images, board)
     if len(points) < FEWEST_IMAGES:
         odd = next(iter(left_out), "")
-        reason = f"; {odd} {board.what_is_missing(images[odd])}" if odd else ""
+        reason = f"; {odd} {stated.what_is_missing(images[odd])}" if odd else ""
         raise PerceptionError(
             f"{len(points)} of {len(images)} images show the board, {FEWEST_IMAGES} are needed{reason}"
         )
     rows, columns = next(iter(images.values())).shape[:2]
-    size = columns, rows
-    error, matrix, distortion, rvecs, tvecs, *_ = cv2.calibrateCameraExtended(
-        list(points.values()), list(pixels.values()), size, np.eye(3), np.zeros(5)
-    )
-    tilts = [
-        np.arccos(np.clip(abs(to_transform(r, t)[2, 2]), 0, 1)) for r, t in zip(rvecs, tvecs, strict=True)
-    ]
+    left_out |= _drop_repeated(points, pixels, columns)
+    if len(points) < FEWEST_IMAGES:
+        raise PerceptionError(
+            f"{len(points)} of {len(images)} images differ, {FEWEST_IMAGES} are needed: show the board from other sides"
+        )
+    views = BoardViews(list(points.values()), list(pixels.values()), (columns, rows))
+    flags, fit = choose_lens(views)
+    views, fit, bend = straighten(views, flags, fit, board)
+    tilts = [np.arccos(np.clip(abs(T[2, 2]), 0, 1)) for T in fit.poses]
     if max(tilts) < LEAST_TILT:
         raise PerceptionError(
             f"no image shows the board slanted by more than {np.rad2deg(max(tilts)):.0f} degrees: "
             "that leaves the focal length open; tilt the board or the camera by 20 to 45 degrees"
         )
-    if not error <= LARGEST_ERROR:
+    if not fit.error <= LARGEST_ERROR:
         raise PerceptionError(
-            f"no camera explains the images: reprojection error {error:.2f} pixels, at most {LARGEST_ERROR} is "
+            f"no camera explains the images: reprojection error {fit.error:.2f} pixels, at most {LARGEST_ERROR} is "
             "accepted; check squares and flatness of the board, and that zoom and focus are fixed"
         )
-    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    camera = PinholeCamera(*size, fx, fy, cx, cy, tuple(np.ravel(distortion)[:5].tolist()))
-    errors = {}
-    for name, rvec, tvec in zip(points, rvecs, tvecs, strict=True):
-        miss = camera.project(points[name], to_transform(rvec, tvec)) - pixels[name]
-        errors[name] = float(np.sqrt((np.linalg.norm(miss, axis=1) ** 2).mean()))
-    return Calibration(camera, float(error), errors, left_out)
+    deviations = deviations_of(views, flags, fit)
+    _check_deviations(deviations, fit.matrix[0, 0], views, tilts)
+    (fx, _, cx), (_, fy, cy), _ = fit.matrix.tolist()
+    camera = PinholeCamera(columns, rows, fx, fy, cx, cy, tuple(fit.lens.tolist()))
+    ends = np.cumsum([2 * len(part) for part in views.points])
+    squared = [2 * (part**2).mean() for part in np.split(fit.residuals, ends[:-1])]
+    errors = dict(zip(points, np.sqrt(squared).tolist(), strict=True))
+    notes = _differences(stated, board, bend, [images[name] for name in list(points)[:3]])
+    return Calibration(camera, fit.error, errors, deviations, left_out, board, notes)
+
+
+def _check_deviations(
+    deviations: Mapping[str, float], focus: float, views: BoardViews, tilts: Sequence[float]
+) -> None:
+    """Refuse a calibration that is too uncertain, with what would make it better."""
+    names = {"fx": "the focal length", "cx": "the centre", "border": "the lens at the image's border"}
+    shares = {
+        name: max(deviations[name], deviations.get(name.replace("x", "y"), 0.0)) / focus for name in names
+    }
+    worst = max(shares, key=lambda name: shares[name])
+    if shares[worst] <= LOOSEST:
+        return
+    size = np.array(views.size)
+    fills = [np.ptp(seen, axis=0) / size for seen in views.pixels]
+    cover = np.ptp(np.concatenate(views.pixels), axis=0) / size
+    advice = [
+        (
+            max(tilts) < GOOD_TILT,
+            f"tilt the board by 25 to 45 degrees (at most {np.rad2deg(max(tilts)):.0f} now)",
+        ),
+        (
+            np.max(fills) < LEAST_FILL,
+            f"fill the image with the board (at most {100 * np.max(fills):.0f} % now)",
+        ),
+        (min(cover) < LEAST_COVER, "hold it in all parts of the image"),
+        (len(tilts) < ENOUGH_IMAGES, f"take 10 to 20 images ({len(tilts)} now)"),
+    ]
+    given = [words for lacks, words in advice if lacks] or [
+        "tilt the board more, both ways, and fill the image with it"
+    ]
+    raise PerceptionError(
+        f"{len(tilts)} images leave {names[worst]} uncertain: standard deviation {100 * shares[worst]:.1f} % of the "
+        f"focal length, at most {100 * LOOSEST:.0f} % is accepted: {', '.join(given)}"
+    )
+
+
+def _drop_repeated(
+    points: dict[str, np.ndarray], pixels: dict[str, np.ndarray], width: int
+) -> dict[str, str]:
+    """Take out views that repeat an earlier one, which would count twice; say of which."""
+    repeated: dict[str, str] = {}
+    kept: list[str] = []
+    for name in list(points):
+        for earlier in kept:
+            here = {
+                tuple(point): pixel for point, pixel in zip(points[name].tolist(), pixels[name], strict=True)
+            }
+            there = zip(points[earlier].tolist(), pixels[earlier], strict=True)
+            apart = [
+                np.linalg.norm(here[tuple(point)] - pixel) for point, pixel in there if tuple(point) in here
+            ]
+            if 2 * len(apart) >= len(points[earlier]) and np.mean(apart) < ALIKE * width:
+                repeated[name] = f"shows the board where {earlier} does"
+                break
+        else:
+            kept.append(name)
+    for name in repeated:
+        del points[name], pixels[name]
+    return repeated
+
+
+def _differences(
+    stated: Board, found: Board, bend: Float[np.ndarray, "2"], images: Sequence[np.ndarray]
+) -> tuple[str, ...]:
+    """What a board turned out to be, in words."""
+    lines = []
+    if found.first_id != stated.first_id:
+        lines.append(f"the board's markers begin at {found.first_id} (--first-id {found.first_id})")
+    if found.legacy != stated.legacy:
+        lines.append(
+            "the board has the pattern of OpenCV before 4.6 (--legacy)"
+            if found.legacy
+            else "the board has the pattern of OpenCV since 4.6 (without --legacy)"
+        )
+    if found.inverted != stated.inverted:
+        lines.append(f"black and white are exchanged on the board (--{'no-' * stated.inverted}inverted)")
+    if np.abs(bend).max() > LEAST_BEND:
+        lines.append(
+            f"the board is bent by {1000 * np.abs(bend).max():.1f} mm, which is taken into account: make it flat"
+        )
+    sides = [side for image in images if (side := found.measure_marker(image)) is not None]
+    if sides and abs(np.median(sides) / stated.marker_length - 1) > LARGEST_RATIO:
+        lines.append(
+            f"markers measure {1000 * np.median(sides):.1f} mm in squares of {1000 * stated.square_length:.1f} mm, not "
+            f"{1000 * stated.marker_length:.1f} mm: measure both"
+        )
+    return tuple(lines)
 
 
 def _find_corners(
@@ -208,22 +216,25 @@ def _find_corners(
     Raises:
         PerceptionError: The images differ in size.
     """
-    sizes = {name: f"{image.shape[1]} x {image.shape[0]}" for name, image in images.items()}
+    sizes = {name: (image.shape[1], image.shape[0]) for name, image in images.items()}
     if len(set(sizes.values())) > 1:
         first, second = list(dict.fromkeys(sizes.values()))[:2]
         odd = next(name for name, size in sizes.items() if size == second)
+        remedy = "calibrate with images of one camera at one resolution"
+        if first == second[::-1]:
+            remedy = "some were turned after they were taken; give them as the camera stored them"
         raise PerceptionError(
-            f"images of different sizes: {odd} has {second} pixels, others {first}: calibrate with images of "
-            "one camera at one resolution"
+            f"images of different sizes: {odd} has {second[0]} x {second[1]} pixels, others {first[0]} x {first[1]}: "
+            f"{remedy}"
         )
     points, pixels, left_out = {}, {}, {}
     for name, image in images.items():
         known, seen = board.find(image)
-        if len(known) < FEWEST_CORNERS or not _spans_plane(known):
+        if len(known) < FEWEST_CORNERS or not spans_plane(known):
             fault = image_fault(image)
             left_out[name] = f"shows {len(known)} corners of the board{fault and ': '}{fault}"
             continue
-        points[name], pixels[name] = known.astype(np.float32), seen.astype(np.float32)
+        points[name], pixels[name] = known, seen
     return points, pixels, left_out
 
 
@@ -244,13 +255,6 @@ def read_images(paths: Sequence[str | Path]) -> dict[str, UInt8[np.ndarray, "row
     if not files:
         raise PerceptionError(f"no image in {', '.join(map(str, paths))}: give {', '.join(SUFFIXES)} files")
     return {str(file): read_image(file) for file in files}
-
-
-def _spans_plane(points: Float[np.ndarray, "k 3"]) -> bool:
-    """Whether points do not lie on one line."""
-    return bool(
-        len(points) >= 4 and np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), 1e-6) == 2
-    )
 
 
 def refine_camera(
@@ -284,7 +288,7 @@ def refine_camera(
     error, matrix, lens, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
         points, pixels, (camera.width, camera.height), camera.matrix, lens, flags=held
     )
-    loose = np.ravel(deviations)[:2].max() > LOOSEST_FOCUS * camera.fx
+    loose = np.ravel(deviations)[:2].max() > LOOSEST * camera.fx
     if not np.isfinite(error) or loose or abs(matrix[0, 0] / camera.fx - 1) > FARTHEST_FOCUS:
         raise PerceptionError(
             f"{len(matches)} images of markers {body.ids} leave the focal length open: slant them more, both ways"

@@ -187,10 +187,20 @@ def image_fault(image: UInt8[np.ndarray, "rows columns *channels"], name: str | 
     sharpness = float(cv2.Laplacian(values, cv2.CV_64F).var())
     if sharpness < BLURRED:
         return f"it is blurred or empty (its Laplacian varies by {sharpness:.1f}, below {BLURRED:g})"
-    fitting = [] if name is None else fitting_dictionaries(image)
-    if fitting and name is not None and name.lower() not in fitting:
+    if name is None:
+        return ""
+    fitting = fitting_dictionaries(image)
+    if fitting and not any(_holds(name.lower(), other) for other in fitting):
         return f"its markers are of {fitting[0]}, not {name}: check the dictionary"
+    if not fitting and len(detect_markers(np.ascontiguousarray(values[:, ::-1]), name).ids):
+        return "it is mirrored: switch mirroring off in the camera's program"
     return ""
+
+
+def _holds(name: str, other: str) -> bool:
+    """Whether a dictionary has all markers of another one: 5x5_50 is the beginning of 5x5_100."""
+    (family, _, size), (other_family, _, other_size) = name.partition("_"), other.partition("_")
+    return name == other or (family == other_family and "x" in family and int(size) >= int(other_size))
 
 
 @dataclass(frozen=True)
