@@ -98,7 +98,8 @@ def export_onnx(run: Positional[Path | None] = None, out: Path = Path("model.onn
     for name, meaning in written.inputs.items():
         print(f"reads {name}: {meaning}")
     for name, meaning in written.outputs.items():
-        print(f"returns {name}: {meaning}; at most {written.differences[name]:.1e} from PyTorch")
+        file, pytorch = written.differences[name]
+        print(f"returns {name}: {meaning}; at most {file:.1e} from float64, PyTorch's float32 {pytorch:.1e}")
     print(written.path)
 
 

@@ -145,8 +145,9 @@ class TracedImageCnn(TracedFeatures):
 
     def forward(self, images: Shaped[Tensor, "batch 128 128"]) -> Float[Tensor, "batch features"]:
         """Every image is convolved whole and in its window, and one of the two is kept."""
-        maps = convolve_unbranched(images[:, None].float() / self.scale, self.features.stack)
-        return F.relu(self.features.dense(maps.flatten(1)))
+        dense = self.features.dense
+        maps = convolve_unbranched(images[:, None].to(dense.weight.dtype) / self.scale, self.features.stack)
+        return F.relu(dense(maps.flatten(1)))
 
 
 class ShapeContextCnn(ConvolutionalFeatures):
