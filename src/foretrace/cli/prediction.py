@@ -1,5 +1,6 @@
 """The command that predicts the motion of an object."""
 
+import warnings
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,7 +32,12 @@ class ObjectOptions:
     """File with the outline's corners: a table with one corner per line, GeoJSON or WKT, in metres unless --scale says
     otherwise."""
     image: Path | None = None
-    """Image of the object's silhouette, white on black; needs --scale."""
+    """Image of the object's silhouette, white on black or opaque on transparent; needs --scale."""
+    label: str | None = None
+    """Value of the object's pixels in an image of several: a number (in an image with a palette its index), or red,
+    green and blue as 128,0,0."""
+    invert: bool = False
+    """The image shows the object black on white."""
     mesh: Path | None = None
     """STL or OBJ file of the object."""
     scale: float | None = None
@@ -50,6 +56,7 @@ class ObjectOptions:
         from foretrace.objects.polygon_files import read_polygon
         from foretrace.objects.prism import DEFAULT_HEIGHT
         from foretrace.objects.shape_files import read_silhouette_image
+        from foretrace.objects.silhouette import likelier_scale
 
         given = [f"--{name}" for name in ("polygon", "image", "mesh") if getattr(self, name) is not None]
         if len(given) != 1:
@@ -58,6 +65,8 @@ class ObjectOptions:
             )
         if self.height is not None and self.mesh is not None:
             raise PredictionError("--height goes with --polygon and --image: a mesh has its own")
+        if self.image is None and (self.label is not None or self.invert):
+            raise PredictionError("--label and --invert go with --image: leave them out")
         height = DEFAULT_HEIGHT if self.height is None else self.height
         if self.polygon is not None:
             return Prism(read_polygon(self.polygon, self.scale), height), None
@@ -65,8 +74,24 @@ class ObjectOptions:
             return MeshObject.load(self.mesh, 1.0 if self.scale is None else self.scale), None
         if self.scale is None or self.image is None:
             raise PredictionError("--image needs --scale, the metres per pixel")
-        mask = read_silhouette_image(self.image)
-        return Prism.from_mask(mask, self.scale, height), mask
+        mask = read_silhouette_image(self.image, self._label(), self.invert)
+        prism = Prism.from_mask(mask, self.scale, height)
+        if (likelier := likelier_scale(prism.size, self.scale)) is not None:
+            warnings.warn(
+                f"the object is {100 * prism.size:.3g} cm long, check --scale: {likelier}", stacklevel=1
+            )
+        return prism, mask
+
+    def _label(self) -> "list[float] | None":
+        """The label as numbers."""
+        if self.label is None:
+            return None
+        try:
+            return [float(value) for value in self.label.split(",")]
+        except ValueError:
+            raise PredictionError(
+                f"--label is {self.label}: give a number, or red, green and blue as 128,0,0"
+            ) from None
 
 
 @dataclass(frozen=True)
@@ -164,7 +189,7 @@ def predict(
     predictor = load_predictor(run)
     seen = None
     if photo.photo is not None:
-        if any(v is not None for v in asdict(replace(obj, height=None)).values()) or at != ContactOptions():
+        if replace(obj, height=None) != ObjectOptions() or at != ContactOptions():
             raise PredictionError("--photo shows the object: leave out the other ways, --edge and --contact")
         seen = photo.observe(obj.height)
         object, action, view, com = seen.placed.object, seen.action, seen.view, seen.com

@@ -205,7 +205,7 @@ def largest_distance(points: Float[np.ndarray, "n 2"]) -> float:
     return float(np.linalg.norm(hull[:, None] - hull[None], axis=-1).max())
 
 
-def check_size(size: float, height: float) -> None:
+def check_size(size: float, height: float, remedy: str = "check unit (metres) or scale") -> None:
     """Refuse objects that are too small or too large to be meant.
 
     Raises:
@@ -214,7 +214,7 @@ def check_size(size: float, height: float) -> None:
     for name, value, (low, high) in (("size", size, SIZE_LIMITS), ("height", height, HEIGHT_LIMITS)):
         if not low <= value <= high:
             raise ShapeError(
-                f"object of {name} {value:.4g} m: expected {low} to {high} m; check unit (metres) or scale"
+                f"object of {name} {value:.4g} m: expected {low} to {high} m; {remedy}"
             )
 
 

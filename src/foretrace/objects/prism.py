@@ -30,7 +30,7 @@ from foretrace.objects.model import (
     largest_distance,
     read_only,
 )
-from foretrace.objects.silhouette import silhouette_polygon
+from foretrace.objects.silhouette import likelier_scale, silhouette_polygon
 
 DEFAULT_HEIGHT = 0.02
 """Height of a prism [m]."""
@@ -116,7 +116,11 @@ class Prism(ObjectModel):
         Raises:
             ShapeError: for a mask that is empty, shows several objects or an object cut off by the border.
         """
+        if not is_number(height):
+            raise ShapeError(f"height is {height!r}: give a number of metres")
         corners = silhouette_polygon(mask, metres_per_pixel, tolerance, blunted)
+        likelier = likelier_scale(size := largest_distance(corners), metres_per_pixel)
+        check_size(size, height, "check unit (metres) or scale" + (f": {likelier}" if likelier else ""))
         return cls(corners, height, bevel or fitting_bevel(corners, height))
 
     def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:

@@ -1,5 +1,6 @@
 """From a binary image of one object to its outline in metres."""
 
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -11,11 +12,17 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from foretrace.errors import ForetraceError, ShapeError, is_number
 from foretrace.geometry import cross, mask_outline
+from foretrace.images import StoredImage, check_pixels
+from foretrace.objects.object_pixels import SPECK, Label, object_pixels
 
-SPECK = 0.01
-"""Objects below this share of the largest one's area are taken for noise."""
 CUT_OFF = 0.25
 """An object that touches the border along more than this share of its extent is taken to be cut off."""
+INVERT = "invert it (--invert, or read_silhouette(mask, invert=True))"
+"""Remedy for an object that is black on white."""
+LARGE_HOLE = 0.02
+"""A hole of this share of the object's area may be the object itself, drawn black on white."""
+RECTANGLE = 0.8
+"""An outline that fills this share of the smallest rectangle round it may be a page; of a circle it is 0.785."""
 TOLERANCE = 0.001
 """How far a polygon may leave the outline that it simplifies [m]."""
 TOLERANCE_PIXELS = 0.75
@@ -33,42 +40,64 @@ LEAST_SINE = 0.17
 """Corners sharper than 20 degrees are put back no further than one of these."""
 FINEST, COARSEST = 1e-6, 0.1
 """Sides of the smallest and of the largest pixels of images [m]."""
+LIKELY_SIZES = (0.02, 0.4)
+"""Objects that are levered are no smaller and no larger, as a rule [m]."""
 FIT_ROUNDS = 5
 """Rounds of fitting a line and weighing its points anew."""
 
 
-def read_silhouette(mask: Shaped[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
-    """The one object in a binary image, without specks and with its holes filled.
+def read_silhouette(
+    mask: Shaped[np.ndarray, "rows columns"], label: Label | None = None, invert: bool = False
+) -> Bool[np.ndarray, "rows columns"]:
+    """The one object in an image, without specks and with its holes filled.
 
     Args:
-        mask: the object white (or True) on black; grey is white above half of the brightest value.
+        mask: the object white (or True) on black; grey is white above the middle between darkest and brightest value.
+        label: the object's value in an image of several labels.
+        invert: the object is black on white; a dark frame round the page is left out.
 
     Raises:
-        ShapeError: if there is no object, more than one, or one that the border cuts off.
+        ShapeError: if there is no object, more than one, or one that the border cuts off, or labels leave it open.
     """
     if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "buif":
         raise ShapeError(f"mask of type {type(mask).__name__}: give an array of numbers, rows x columns")
     if mask.ndim != 2:
         raise ShapeError(f"mask has shape {mask.shape}: give one channel, rows x columns")
-    if mask.size == 0 or not mask.any():
+    check_pixels("mask", mask.shape[0], mask.shape[1], ShapeError)
+    return _one_object(object_pixels(StoredImage(mask), label, invert))
+
+
+def _one_object(white: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
+    """The largest part of what is white, its holes filled."""
+    binary = np.ascontiguousarray(white, dtype=np.uint8)
+    if not binary.any():
         raise ShapeError(
-            f"mask of {mask.shape[1]} x {mask.shape[0]} pixels is empty: draw the object white on black"
+            f"mask of {binary.shape[1]} x {binary.shape[0]} pixels is empty: draw the object white on black"
         )
-    grey = np.nan_to_num(mask.astype(np.float32))
-    binary = (grey > 0.5 * grey.max()).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
-    num_objects = int((areas >= SPECK * areas.max()).sum())
-    if num_objects > 1:
-        raise ShapeError(f"mask shows {num_objects} separate objects: keep one, or join its parts")
-    found = labels == 1 + int(np.argmax(areas))
-    _check_border(found)
+    large = 1 + np.flatnonzero(areas >= SPECK * areas.max())
+    if len(large) > 1:
+        border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+        hint = f", or, if it is black on white, {INVERT}" if np.isin(large, border).all() else ""
+        raise ShapeError(f"mask shows {len(large)} separate objects: keep one, or join its parts{hint}")
+    found = labels == large[0]
     contours, _ = cv2.findContours(found.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    filled = cv2.drawContours(np.zeros_like(binary), contours, -1, 1, cv2.FILLED)
-    return filled.astype(bool)
+    filled = cv2.drawContours(np.zeros_like(binary), contours, -1, 1, cv2.FILLED).astype(bool)
+    area = np.count_nonzero(filled)
+    hole = 1 - float(areas.max()) / area
+    _check_border(found, hole)
+    if hole >= LARGE_HOLE and area > RECTANGLE * np.prod(cv2.minAreaRect(contours[0])[1]):
+        warnings.warn(
+            f"the object is a rectangle with holes of {100 * hole:.0f} % of its area, which are filled: if it is the "
+            f"page and the object is black on it, {INVERT}",
+            stacklevel=1,
+        )
+    return filled
 
 
-def _check_border(found: Bool[np.ndarray, "rows columns"]) -> None:
+def _check_border(found: Bool[np.ndarray, "rows columns"], hole: float) -> None:
+    """Refuse an object that the border cuts off, or that is what surrounds the object."""
     rows, columns = int(found.any(axis=1).sum()), int(found.any(axis=0).sum())
     sides = {
         "top": (found[0], columns),
@@ -77,12 +106,19 @@ def _check_border(found: Bool[np.ndarray, "rows columns"]) -> None:
         "right": (found[:, -1], rows),
     }
     # A tight crop touches the border with a few pixels of each extreme; a cut leaves a long straight side.
-    for side, (pixels, extent) in sides.items():
-        if pixels.sum() > CUT_OFF * extent:
-            raise ShapeError(
-                f"object touches the {side} border of the mask along {int(pixels.sum())} of {extent} pixels: "
-                "show it whole, white on black, and add a black margin if it only fills the image"
-            )
+    touched = {side: at for side, at in sides.items() if at[0].sum() > CUT_OFF * at[1]}
+    if not touched:
+        return
+    if hole >= LARGE_HOLE or (len(touched) > 2 and not found.all()):
+        raise ShapeError(
+            f"white touches the {' and '.join(touched)} border of the mask: if the object is black on white, {INVERT}; "
+            "if it is white and fills the image, add a black margin"
+        )
+    side, (pixels, extent) = next(iter(touched.items()))
+    raise ShapeError(
+        f"object touches the {side} border of the mask along {int(pixels.sum())} of {extent} pixels: "
+        "show it whole, white on black, and add a black margin if it only fills the image"
+    )
 
 
 def check_scale(metres_per_pixel: Any, error: type[ForetraceError]) -> None:
@@ -93,9 +129,22 @@ def check_scale(metres_per_pixel: Any, error: type[ForetraceError]) -> None:
         )
 
 
+def likelier_scale(size: float, metres_per_pixel: float) -> str | None:
+    """Which scale is likelier than the one [m] that gives an object its size [m]; None where the size is usual."""
+    low, high = LIKELY_SIZES
+    if low <= size <= high:
+        return None
+    power = float(10.0 ** np.round(np.log10(np.sqrt(low * high) / size)))
+    return (
+        f"{power * metres_per_pixel:g} m per pixel in place of {metres_per_pixel:g} would make it "
+        f"{100 * power * size:.3g} cm"
+    )
+
+
 def silhouette_origin(silhouette: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2"]:
     """Centroid (row, column) of a silhouette's pixels: the origin of the object frame."""
-    return np.argwhere(silhouette).mean(axis=0)
+    along = [np.count_nonzero(silhouette, axis=axis) for axis in (1, 0)]
+    return np.array([np.arange(len(counts)) @ counts / counts.sum() for counts in along])
 
 
 def silhouette_polygon(
@@ -119,6 +168,9 @@ def silhouette_polygon(
         ShapeError: if the image does not show one whole object, or the scale is not positive.
     """
     check_scale(metres_per_pixel, ShapeError)
+    for name, value in (("tolerance", tolerance), ("blunted", blunted)):
+        if value is not None and not (is_number(value) and 0 <= value < COARSEST):
+            raise ShapeError(f"{name} is {value!r}: give a length from 0 to {COARSEST:g} m")
     silhouette = read_silhouette(mask)
     rows, columns = (mask_outline(silhouette) - silhouette_origin(silhouette)).T
     outline = np.column_stack([columns, -rows])[::-1]  # x, y in pixels, counter-clockwise
