@@ -54,7 +54,7 @@ def test_unusable_actions_are_refused(contact, direction, fault):
 
 
 def test_nearest_snaps_to_the_outline():
-    action = LeverUp.nearest(SQUARE, (0.05, -0.03))
+    action = LeverUp.nearest(SQUARE, (0.05, -0.015))
     np.testing.assert_allclose(action.contact, [0.05, 0.0], atol=1e-12)
     np.testing.assert_allclose(action.direction, [0.0, 1.0])
     inside = LeverUp.nearest(SQUARE, (0.195, 0.05))
@@ -63,7 +63,7 @@ def test_nearest_snaps_to_the_outline():
 
 def test_nearest_keeps_off_the_corners():
     # Beyond corner 1, but more to the right of it than below: edge 1 faces the point.
-    action = LeverUp.nearest(SQUARE, (0.23, -0.01))
+    action = LeverUp.nearest(SQUARE, (0.215, -0.005))
     np.testing.assert_allclose(action.contact, [0.2, CORNER_MARGIN])
     np.testing.assert_allclose(action.direction, [-1.0, 0.0])
 
@@ -72,6 +72,12 @@ def test_nearest_on_an_edge_shorter_than_the_margin():
     corners = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1], [-0.0004, 0.0999]])
     action = LeverUp.nearest(Prism(corners, bevel=NO_BEVEL), (-0.0005, 0.1005))
     assert np.isfinite(action.contact).all()
+
+
+@pytest.mark.parametrize("point", [(0.05, -0.0201), (70.0, 0.0), (0.1, 0.1), (1e200, 1e200)])
+def test_nearest_refuses_what_is_far_from_the_outline(point):
+    with pytest.raises(ActionError, match=r"m from the outline: choose one within 0.02 m"):
+        LeverUp.nearest(SQUARE, point)
 
 
 def test_nearest_refuses_nan():

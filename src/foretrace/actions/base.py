@@ -19,6 +19,8 @@ from foretrace.registry import Registry
 
 CORNER_MARGIN = 0.001
 """A contact point snapped to the outline keeps this distance from the corners [m]."""
+LARGEST_SNAP = 0.02
+"""A contact point farther from the outline is a mistake and is not moved there [m]."""
 CONTACT_TOLERANCE = 0.005
 """A contact may lie this far from the outline, as when it was measured with an error [m]."""
 FARTHEST = 100.0
@@ -157,7 +159,7 @@ class Action(ABC):
         """The action at the point of the outline nearest to a given one, along that edge's inward normal.
 
         Near a corner the contact keeps a millimetre from it (or half of a shorter edge), on the edge that
-        faces the point more directly.
+        faces the point more directly. A point farther than `LARGEST_SNAP` from the outline is a mistake.
 
         Args:
             obj: The object.
@@ -165,7 +167,7 @@ class Action(ABC):
             **settings: Path and tool, if not the default ones.
 
         Raises:
-            ActionError: If the point is not finite.
+            ActionError: If the point is not finite or too far from the outline.
         """
         check_type("obj", obj, ObjectModel, ActionError)
         point = plane_vector("contact point", point)
@@ -175,7 +177,14 @@ class Action(ABC):
         margin = np.minimum(CORNER_MARGIN / lengths, 0.5)
         fractions = np.clip(along, margin, 1 - margin)
         contacts = starts + fractions[:, None] * (stops - starts)
-        edge = int(np.argmin(np.linalg.norm(contacts - point, axis=1)))
+        with np.errstate(over="ignore"):
+            gaps = np.linalg.norm(contacts - point, axis=1)
+        edge = int(np.argmin(gaps))
+        if gaps[edge] > LARGEST_SNAP:
+            raise ActionError(
+                f"contact point ({point[0]:.4g}, {point[1]:.4g}) m lies {gaps[edge]:.3g} m from the outline: choose "
+                f"one within {LARGEST_SNAP} m of it, in metres"
+            )
         return cls(contacts[edge], inward_normals(obj.corners)[edge], **settings)
 
     def check_contact(self, obj: ObjectModel) -> None:

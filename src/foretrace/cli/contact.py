@@ -2,14 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from foretrace.actions import LeverUp
-from foretrace.errors import ActionError, PredictionError
+from foretrace.errors import PredictionError
 from foretrace.objects import ObjectModel
-
-LARGEST_SNAP = 0.02
-"""A contact point farther from the outline is a mistake and is not moved there [m]."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +42,4 @@ class ContactOptions:
         if self.share is not None:
             return LeverUp.at_edge(obj, *self.share)
         assert self.contact is not None
-        action = LeverUp.nearest(obj, self.contact)
-        gap = float(np.linalg.norm(action.contact - self.contact))
-        if gap > LARGEST_SNAP:
-            raise ActionError(
-                f"contact {self.contact} lies {gap:.3f} m from the outline: choose a point within {LARGEST_SNAP} m"
-            )
-        return action
+        return LeverUp.nearest(obj, self.contact)

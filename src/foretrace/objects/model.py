@@ -213,9 +213,7 @@ def check_size(size: float, height: float, remedy: str = "check unit (metres) or
     """
     for name, value, (low, high) in (("size", size, SIZE_LIMITS), ("height", height, HEIGHT_LIMITS)):
         if not low <= value <= high:
-            raise ShapeError(
-                f"object of {name} {value:.4g} m: expected {low} to {high} m; {remedy}"
-            )
+            raise ShapeError(f"object of {name} {value:.4g} m: expected {low} to {high} m; {remedy}")
 
 
 def inner_radius(corners: Float[np.ndarray, "n 2"]) -> float:

@@ -20,6 +20,7 @@ SAME_LABEL = (0.02, 0.1)
 """Values nearer to each other than this share of all are the same label, in images of few values and of many."""
 BEYOND = 0.25
 """A value farther outside the labels than this share of their range belongs to no blurred edge between them."""
+BLURRED = "is blurred or was compressed as JPEG: save labels as PNG, or paint the object white on black"
 SPECK = 0.01
 """Objects below this share of the largest one's area are taken for noise."""
 SHOWN = 8
@@ -60,7 +61,13 @@ def object_pixels(
             raise ShapeError(
                 f"mask of {values.shape[1]} x {values.shape[0]} pixels is empty: draw the object white on black"
             )
-        _check_labels(values)
+        labels, exact = _labels(values) if values.dtype != np.bool_ else (np.arange(2), True)
+        if len(labels) > 2:
+            labels = labels if palette is None else _labels(palette)[0]
+            remedy = "choose the object's (--label, or read_silhouette(mask, label=...)), or paint it white on black"
+            raise ShapeError(
+                f"mask holds the values {_names(labels)}" + (f": {remedy}" if exact else f" and {BLURRED}")
+            )
         white = _bright(_grey(values))
     return _without_frame(~white) if invert else white
 
@@ -99,10 +106,11 @@ def _labelled(
     if wanted.size == 1 and values.ndim == 3:
         raise ShapeError(f"label {label!r} in a mask of colours: give red, green and blue")
     found = values == wanted[0] if values.ndim == 2 else (values == wanted).all(axis=2)
+    labels, exact = _labels(values)
+    if not exact:
+        raise ShapeError(f"label {_name(wanted)} in a mask that {BLURRED}")
     if not found.any():
-        raise ShapeError(
-            f"label {_name(wanted)} is not in the mask, which holds {_names(_levels(_sampled(values))[0])}"
-        )
+        raise ShapeError(f"label {_name(wanted)} is not in the mask, which holds {_names(labels)}")
     return found
 
 
@@ -112,14 +120,11 @@ def _sampled(values: np.ndarray) -> np.ndarray:
     return values[::step, ::step]
 
 
-def _check_labels(values: Shaped[np.ndarray, "rows columns *channels"]) -> None:
-    """Refuse an image of more than two labels.
+def _labels(values: Shaped[np.ndarray, "rows columns *channels"]) -> tuple[np.ndarray, bool]:
+    """Labels of an image: values of areas, and of lines that are no blurred edge; and whether they are exact.
 
-    Raises:
-        ShapeError: Naming them.
+    Where they are not, blur or compression makes other values of them. Edges that are blurred in few steps are exact.
     """
-    if values.dtype == np.bool_:
-        return
     sample = _sampled(values)
     if sample.ndim == 3 and sample.dtype.kind == "f":
         sample = _grey(sample)
@@ -127,34 +132,27 @@ def _check_labels(values: Shaped[np.ndarray, "rows columns *channels"]) -> None:
     if len(levels) > FEW_VALUES**2 and levels.ndim == 2:  # a photograph, or JPEG's traces of few colours
         levels, codes, counts = _levels(_grey(sample))
     if len(levels) <= 2:
-        return
+        return levels, True
     brightness = _grey(levels[None].astype(np.float32))[0] if levels.ndim == 2 else levels.astype(float)
-    few = len(levels) <= FEW_VALUES
-    near = SAME_LABEL[0 if few else 1] * np.ptp(brightness)
     codes = codes.astype(np.float32)  # what OpenCV compares; exact up to 16 million values
-    labels = [
-        int(k)
-        for k in np.flatnonzero(np.bincount(codes[_flat(codes, THICK)].astype(int), minlength=len(levels)))
-    ]
-    if not few:
+    inner = codes[_flat(codes, THICK)].astype(int)
+    labels = np.flatnonzero(np.bincount(inner, minlength=len(levels))).tolist()
+    exact = len(levels) <= max(FEW_VALUES, 2 * len(labels))
+    near = SAME_LABEL[0 if exact else 1] * float(np.ptp(brightness))
+    if not exact:
         labels = _merged(labels, brightness, counts, near)
     rest = counts.copy()
     rest[labels] = 0
     odd = int(rest.argmax())
-    if labels and 2 * rest[odd] > rest.sum():
+    if labels and 2 * rest[odd] > rest.sum():  # a value of its own, not one of many along an edge
         known = brightness[labels]
         gap = BEYOND * np.ptp(known)
         thick = np.abs(known - brightness[odd]).min() > near and bool(
-            (_flat(codes, 3) & (codes == odd)).any()
+            (_flat(codes, 2) & (codes == odd)).any()
         )
         if thick or (len(labels) > 1 and not known.min() - gap <= brightness[odd] <= known.max() + gap):
             labels.append(odd)
-    if len(labels) > 2:
-        names = _names(levels[sorted(labels)])
-        raise ShapeError(
-            f"mask holds the values {names}: choose the object's (--label, or read_silhouette(mask, label=...)), or paint "
-            "it white on black"
-        )
+    return levels[sorted(labels)], exact
 
 
 def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -203,6 +201,7 @@ def _names(levels: np.ndarray) -> str:
     return ", ".join(_name(level) for level in levels[:SHOWN]) + more
 
 
-def _name(level: np.ndarray) -> str:
+def _name(level: np.ndarray | np.generic) -> str:
     """A value, or a colour."""
-    return " ".join(f"{value:g}" for value in np.atleast_1d(level))
+    numbers = ",".join(f"{value:g}" for value in np.atleast_1d(level))
+    return f"({numbers})" if np.size(level) > 1 else numbers

@@ -20,6 +20,7 @@ from foretrace.geometry import (
 )
 from foretrace.objects.model import (
     BEVEL,
+    SIZE_LIMITS,
     Bevel,
     MassProperties,
     ObjectModel,
@@ -118,8 +119,10 @@ class Prism(ObjectModel):
         """
         if not is_number(height):
             raise ShapeError(f"height is {height!r}: give a number of metres")
+        check_size(SIZE_LIMITS[0], height)
         corners = silhouette_polygon(mask, metres_per_pixel, tolerance, blunted)
-        likelier = likelier_scale(size := largest_distance(corners), metres_per_pixel)
+        size = largest_distance(corners)
+        likelier = likelier_scale(size, metres_per_pixel)
         check_size(size, height, "check unit (metres) or scale" + (f": {likelier}" if likelier else ""))
         return cls(corners, height, bevel or fitting_bevel(corners, height))
 

@@ -87,7 +87,8 @@ def _one_object(white: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "ro
     area = np.count_nonzero(filled)
     hole = 1 - float(areas.max()) / area
     _check_border(found, hole)
-    if hole >= LARGE_HOLE and area > RECTANGLE * np.prod(cv2.minAreaRect(contours[0])[1]):
+    sides = np.add(cv2.minAreaRect(contours[0])[1], 1)  # the contour runs through the pixels' centres
+    if hole >= LARGE_HOLE and area > RECTANGLE * sides.prod():
         warnings.warn(
             f"the object is a rectangle with holes of {100 * hole:.0f} % of its area, which are filled: if it is the "
             f"page and the object is black on it, {INVERT}",
@@ -111,7 +112,7 @@ def _check_border(found: Bool[np.ndarray, "rows columns"], hole: float) -> None:
         return
     if hole >= LARGE_HOLE or (len(touched) > 2 and not found.all()):
         raise ShapeError(
-            f"white touches the {' and '.join(touched)} border of the mask: if the object is black on white, {INVERT}; "
+            f"white touches the {', '.join(touched)} border of the mask: if the object is black on white, {INVERT}; "
             "if it is white and fills the image, add a black margin"
         )
     side, (pixels, extent) = next(iter(touched.items()))

@@ -15,12 +15,13 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
 from foretrace.actions import LeverUp
-from foretrace.errors import PerceptionError, ShapeError
+from foretrace.errors import ActionError, PerceptionError, ShapeError
 from foretrace.geometry import convex_hull, invert_transform, planar_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import BEVEL, ObjectModel, Prism, read_silhouette, silhouette_origin
 from foretrace.perception.masks import DEPTH_RIM
+from foretrace.perception.shadows import filled
 
 GRID = 0.00025
 """Side of a pixel of the rectified mask [m]."""
@@ -32,8 +33,6 @@ SMOOTHING = 1.0
 """Standard deviation by which the steps of a mask's border are smoothed [pixel]."""
 LARGEST_OBJECT = 1.0
 """No object is larger than this [m]."""
-LARGEST_SNAP = 0.02
-"""A contact further from the outline than this is refused [m]."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +115,7 @@ def place_object(
     flat &= _lay_out(smooth, camera, T_table_camera, low, size, rim)
     try:
         blunted = BLUNTED * pixel_size(camera, T_table_camera, reach.mean(axis=0))
+        flat = filled(flat)
         prism = Prism.from_mask(flat, GRID, height, tolerance=TOLERANCE, blunted=blunted)
         if hull:
             prism = Prism(convex_hull(prism.corners), height, prism.bevel)
@@ -254,14 +254,10 @@ def observe(placed: PlacedObject, contact: Float[np.ndarray, "2"]) -> Observatio
     Raises:
         PerceptionError: The contact lies far from the outline.
     """
-    action = LeverUp.nearest(placed.object, contact)
-    gap = float(np.linalg.norm(action.contact - contact))
-    if gap > LARGEST_SNAP:
-        x, y = contact
-        raise PerceptionError(
-            f"contact ({x:.3f}, {y:.3f}) m lies {gap:.3f} m from the object's outline: choose a point within "
-            f"{LARGEST_SNAP} m of it"
-        )
+    try:
+        action = LeverUp.nearest(placed.object, contact)
+    except ActionError as error:
+        raise PerceptionError(str(error)) from None
     return Observation(placed, action, TopDownView.of(placed.object, action))
 
 
