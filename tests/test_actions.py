@@ -74,7 +74,7 @@ def test_nearest_on_an_edge_shorter_than_the_margin():
     assert np.isfinite(action.contact).all()
 
 
-@pytest.mark.parametrize("point", [(0.05, -0.0201), (70.0, 0.0), (0.1, 0.1), (1e200, 1e200)])
+@pytest.mark.parametrize("point", [(0.05, -0.0201), (70.0, 0.0), (0.1, 0.05), (1e200, 1e200)])
 def test_nearest_refuses_what_is_far_from_the_outline(point):
     with pytest.raises(ActionError, match=r"m from the outline: choose one within 0.02 m"):
         LeverUp.nearest(SQUARE, point)

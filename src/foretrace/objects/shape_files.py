@@ -34,31 +34,6 @@ def read_shape(path: Path, height: float | None = None) -> ObjectModel:
     return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)
 
 
-<<<<<<< HEAD
-def read_silhouette_image(file: Path) -> UInt8[np.ndarray, "rows columns"]:
-    """A silhouette's image in grey.
-=======
-def read_polygon(file: Path) -> Float[np.ndarray, "n 2"]:
-    """Corners [m] from a text file with one "x y" or "x,y" per line; ``#`` starts a comment.
-
-    Raises:
-        ShapeError: The file is missing or is no such table.
-    """
-    try:
-        text = file.read_text(encoding="utf-8")
-        lines = [line.split("#")[0].replace(",", " ").strip() for line in text.splitlines()]
-        corners = np.loadtxt([line for line in lines if line] or ["nan"], ndmin=2)
-    except (OSError, ValueError) as error:
-        raise ShapeError(
-            f'cannot read corners from {file} ({error}): write one "x y" per line [m]'
-        ) from error
-    if not any(lines):
-        raise ShapeError(f'{file} holds no corners: write one "x y" per line [m]')
-    if corners.ndim != 2 or corners.shape[1] != 2:
-        raise ShapeError(f'{file} has {corners.shape[-1]} numbers per line: write one "x y" per line [m]')
-    return corners
-
-
 def read_silhouette_image(
     file: Path, label: Label | None = None, invert: bool = False
 ) -> Bool[np.ndarray, "rows columns"]:
@@ -68,7 +43,6 @@ def read_silhouette_image(
         file: The image.
         label: The object's value in an image of several labels.
         invert: The object is black on white.
->>>>>>> 746e772 (Masks: transparency, depth of values, labels and inversion are read as they are meant or named)
 
     Raises:
         ShapeError: The file cannot be read as an image, or leaves open which is the object.
