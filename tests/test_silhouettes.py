@@ -112,6 +112,7 @@ def test_thin_objects_get_a_narrower_bevel():
 @given(seeds)
 @example(51)
 @example(122)
+@example(1000000)
 def test_random_blobs_become_prisms(seed):
     rng = np.random.default_rng(seed)
     noise = cv2.GaussianBlur(rng.normal(size=(160, 200)), (0, 0), rng.uniform(4, 14))

@@ -131,7 +131,7 @@ def check_pixels(source: str | Path, rows: int, columns: int, error: type[Foretr
     """Refuse an image of more than `MOST_PIXELS` pixels, by an error of the given class."""
     if rows * columns > MOST_PIXELS:
         raise error(
-            f"{source} has {columns} x {rows} pixels: scale it down to {MOST_PIXELS // 1_000_000} million at most"
+            f"{source} has {columns} x {rows} pixels: scale it down to {MOST_PIXELS / 1e6:.0f} million at most"
         )
 
 

@@ -11,7 +11,7 @@ import shapely
 from jaxtyping import Bool, Float, Int, Shaped
 
 from foretrace.errors import ForetraceError, ShapeError, is_number
-from foretrace.geometry import cross, mask_outline
+from foretrace.geometry import cross, mask_outline, polygon_area
 from foretrace.images import StoredImage, check_pixels
 from foretrace.objects.object_pixels import SPECK, Label, object_pixels
 
@@ -42,6 +42,8 @@ FINEST, COARSEST = 1e-6, 0.1
 """Sides of the smallest and of the largest pixels of images [m]."""
 LIKELY_SIZES = (0.02, 0.4)
 """Objects that are levered are no smaller and no larger, as a rule [m]."""
+LOST_AREA = 0.03
+"""Refined corners that lose or gain more than this share of the object's area have lost a part of it."""
 FIT_ROUNDS = 5
 """Rounds of fitting a line and weighing its points anew."""
 
@@ -181,7 +183,10 @@ def silhouette_polygon(
     corners = outline[chosen]
     refined = refine_corners(outline, chosen, pixels, max(blunted / metres_per_pixel, BLUNTED))
     if len(refined) >= 3 and shapely.Polygon(refined).is_valid:
-        corners = refined
+        area = np.count_nonzero(silhouette)
+        off, usual = (abs(polygon_area(polygon) - area) for polygon in (refined, corners))
+        if off <= max(LOST_AREA * area, usual):
+            corners = refined
     return corners * metres_per_pixel
 
 
