@@ -1,9 +1,13 @@
 """Motions through ur_rtde over real sockets, on the tests' own controller: nothing here has met a real arm."""
 
+import contextlib
 import csv
+import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +19,7 @@ import pytest
 from foretrace.actions import Screwdriver
 from foretrace.errors import RobotError
 from foretrace.interactions.recording_folder import RecordingNotes
+from foretrace.robot import controller as controller_module
 from foretrace.robot.checks import ArmLimits
 from foretrace.robot.deviation import OTHER_ARM
 from foretrace.robot.execution import SETTLE, MotionLog, WatchConfig, execute
@@ -339,6 +344,59 @@ def test_an_unsafe_way_to_the_start_is_refused(kinematics, recording):
 def test_a_controller_that_is_not_there_is_named(kinematics, recording):
     with pytest.raises(RobotError, match=r"no UR controller answers at 127\.0\.0\.1, port 30004"):
         go("127.0.0.1", kinematics, recording)
+
+
+GREETING = b"\0\4V\1"
+"""RTDE's yes to version 2."""
+
+
+def hang_up(connection: socket.socket, *said: bytes) -> None:
+    connection.recv(100)
+    for words in said:
+        connection.sendall(words)
+    connection.close()
+
+
+def flood(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while True:
+            connection.sendall(b"\0\3x" * 1000)
+
+
+@pytest.mark.parametrize(
+    ("serve", "said"),
+    [
+        (lambda connection: None, "timed out"),
+        (hang_up, "hung up|reset by peer"),
+        (
+            lambda connection: hang_up(connection, b"HTTP/1.1 400 Bad Request\r\n\r\n"),
+            "hung up|reset by peer",
+        ),
+        (lambda connection: hang_up(connection, GREETING), "hung up|reset by peer"),
+        (lambda connection: connection.sendall(GREETING), "timed out"),
+        (lambda connection: connection.sendall(b"\0\4V\0"), "does not speak RTDE version 2"),
+        (flood, "does not speak RTDE version 2"),
+        (lambda connection: connection.sendall(GREETING + b"\0\x0dO\1NOT_FOUND"), "does not tell timestamp"),
+    ],
+)
+def test_what_is_no_controller_is_named_and_never_waited_for(monkeypatch, serve, said):
+    monkeypatch.setattr(controller_module, "PATIENCE", 0.3)
+    host, kept = f"127.201.{os.getpid() // 250 % 250 + 1}.{os.getpid() % 250 + 1}", []
+
+    def accept() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                kept.append(listener.accept()[0])
+                serve(kept[-1])
+
+    with socket.create_server((host, 30004)) as listener:
+        threading.Thread(target=accept, daemon=True).start()
+        message = rf"no UR controller answers at {host}, port 30004 \(.*({said})"
+        with pytest.raises(RobotError, match=message):
+            controller_module.UrController(host, 0.2)
+        listener.shutdown(socket.SHUT_RDWR)  # which ends the wait for the next one
+    for connection in kept:
+        connection.close()
 
 
 def test_an_older_recording_is_not_overwritten(recording):

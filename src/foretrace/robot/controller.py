@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float
@@ -38,6 +38,8 @@ STOP_DECELERATION = 2.0
 """Deceleration of the tool when the arm is stopped [m/s^2]."""
 LOOKAHEAD, GAIN = 0.1, 300.0
 """Smoothing of the set points [s], and stiffness, of URScript's servoj: its defaults."""
+MOST_MESSAGES = 1000
+"""So many messages may come before the one that is waited for."""
 VARIABLES = [
     "timestamp",
     "actual_q",
@@ -258,11 +260,9 @@ def _greet(host: str) -> None:
     """
     port = RTDE_PORT
     try:
-        with socket.create_connection((host, port), PATIENCE) as rtde:
+        with socket.create_connection((host, port), PATIENCE) as rtde, rtde.makefile("rb") as stream:
             rtde.settimeout(PATIENCE)
-            rtde.sendall(struct.pack(">HcH", 5, b"V", 2))  # may we speak version 2 of the protocol?
-            if rtde.recv(1024) != struct.pack(">HcB", 4, b"V", 1):
-                raise OSError("it does not speak RTDE version 2")
+            _hear_once(rtde, stream)
         port = DASHBOARD_PORT
         with dashboard(host, PATIENCE):
             pass
@@ -272,6 +272,41 @@ def _greet(host: str) -> None:
         raise RobotError(
             f"no UR controller answers at {host}, port {port} ({error}): check address, cable and that the arm is on"
         ) from error
+
+
+def _hear_once(rtde: socket.socket, stream: BinaryIO) -> None:
+    """Ask for the arm's data as ur_rtde will, and wait for the first of them.
+
+    Raises:
+        OSError: If they do not come.
+    """
+
+    def ask(kind: bytes, content: bytes) -> bytes:
+        rtde.sendall(struct.pack(">Hc", 3 + len(content), kind) + content)
+        return hear(kind)
+
+    def hear(wanted: bytes) -> bytes:
+        for _ in range(MOST_MESSAGES):  # texts for the log come between
+            start = stream.read(3)
+            size, kind = struct.unpack(">Hc", start) if len(start) == 3 else (0, b"")
+            content = stream.read(max(size - 3, 0))
+            if size < 3 or len(content) != size - 3:
+                raise OSError("it hung up")
+            if kind == wanted:
+                return content
+        raise OSError("it does not speak RTDE version 2")
+
+    if ask(b"V", struct.pack(">H", 2)) != b"\1":
+        raise OSError("it does not speak RTDE version 2")
+    wanted = struct.pack(">d", 1 / CONTROL_PERIOD) + ",".join(VARIABLES).encode()
+    types = ask(b"O", wanted)[1:].decode(errors="replace")
+    if missing := [
+        name for name, kind in zip(VARIABLES, types.split(","), strict=False) if kind == "NOT_FOUND"
+    ]:
+        raise OSError(f"it does not tell {missing[0]}")
+    if ask(b"S", b"") != b"\1":
+        raise OSError("it sends no data")
+    hear(b"U")
 
 
 def _connect(host: str, make: Callable[[], Any]) -> Any:

@@ -11,6 +11,9 @@ DASHBOARD_PORT = 29999
 PATIENCE = 2.0
 """How long an answer may take [s]."""
 LONGEST_LINE = 1024
+NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*")
+"""Names of machines, and addresses of IPv4."""
+ADDRESS_6 = re.compile(r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*:[0-9A-Fa-f.]*(%\w+)?")
 MODEL, SERIES = "UR10", 3
 """The arm whose kinematics is used: its model, and the number that PolyScope's versions on a CB3 begin with."""
 E_SERIES = 5
@@ -23,12 +26,14 @@ def check_host(host: str) -> None:
     Raises:
         RobotError: If it is none.
     """
-    if not isinstance(host, str) or not re.fullmatch(r"[A-Za-z0-9._:-]{1,253}", host):
+    if isinstance(host, str) and re.fullmatch(r"[^:]+:\d+", host):
+        raise RobotError(
+            f"host {host[:80]!r} has a port: leave it out, a controller's ports are always the same"
+        )
+    if not isinstance(host, str) or not (NAME.fullmatch(host) or ADDRESS_6.fullmatch(host)):
         raise RobotError(
             f"host {str(host)[:80]!r} is no name or address of a controller: give one such as 192.168.1.10"
         )
-    if re.fullmatch(r"[^:]+:\d+", host):
-        raise RobotError(f"host {host!r} has a port: leave it out, a controller's ports are always the same")
 
 
 @contextmanager
