@@ -1,25 +1,50 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/installed
+LOCKED := $(BIN)/pip install --quiet --require-hashes --no-deps
+OPTIONAL := ^(pybullet|pyrealsense2|rerun-sdk|rosbags|ur-rtde|onnx|onnxruntime|onnxscript)==
 
 # `make quick`: these files without their slow tests, under 45 seconds on two idle cores.
 QUICK := actions arm checkpoint cli dataset features geometry golden lever_up meshes objects predictor solids splits \
 	statistics surface topdown trajectories windows
 
-.PHONY: setup demo test quick check bench figures checkpoint docs clean
+.PHONY: setup lock audit licences demo test quick check bench figures checkpoint docs clean
 
 setup: $(STAMP)
 
-# The CPU build of torch is pinned in constraints.txt; unpinned it would bring several GB of CUDA.
-$(STAMP): pyproject.toml constraints.txt
+# Every package is the file that requirements.lock names by its checksum; torch alone is another file on machines with
+# and without a GPU, and its version is in constraints.txt. The lines of OPTIONAL packages wait: some have no wheels for
+# some machines.
+$(STAMP): pyproject.toml requirements.lock constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
+	grep -vE '$(OPTIONAL)' requirements.lock > .venv/packages.txt
+	$(LOCKED) -r .venv/packages.txt
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,docs,video]'
-	for package in pybullet pyrealsense2 rerun-sdk rosbags ur_rtde onnx onnxruntime onnxscript; do \
-		$(BIN)/pip install --quiet --constraint constraints.txt --only-binary :all: $$package \
-			|| echo "no $$package for this Python: its tests are skipped"; \
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	grep -E '$(OPTIONAL)' requirements.lock | while read -r line; do \
+		echo "$$line" > .venv/package.txt; \
+		$(LOCKED) --only-binary :all: -r .venv/package.txt \
+			|| echo "no $${line%% *} for this Python: its tests are skipped"; \
 	done
 	touch $(STAMP)
+
+# After a change of the dependencies; versions that fit stay as they are. The lines of packages that torch brings on
+# machines with a GPU are left out.
+lock:
+	$(BIN)/pip install --quiet uv
+	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --python-version 3.11.5 --generate-hashes \
+		--constraint constraints.txt --no-emit-package torch --no-annotate --no-header --quiet \
+		--output-file requirements.lock
+	sed -i -e ':join' -e '/\\$$/{N;s/ *\\\n */ /;bjoin}' requirements.lock
+	sed -i -E '/^(nvidia|cuda|triton)-?/d' requirements.lock
+
+audit: setup
+	test -d .venv/audit || $(PYTHON) -m venv .venv/audit
+	.venv/audit/bin/pip install --quiet pip-audit
+	.venv/audit/bin/python .ci/audit.py
+
+licences: setup
+	$(BIN)/python .ci/licences.py > docs/results/licences.md
 
 demo: setup
 	$(BIN)/foretrace demo --out demo
