@@ -18,7 +18,11 @@ for _limit in ("dict", "list", "tuple", "set", "frozenset", "deque", "array", "l
 
 
 class ForetraceError(Exception):
-    """Base of every error that foretrace raises on purpose."""
+    """Base of every error that foretrace raises on purpose. Its message is one line, whatever it quotes."""
+
+    def __str__(self) -> str:
+        message = super().__str__()
+        return " ".join(message.split()) if "\n" in message else message
 
 
 class CommandError(ForetraceError):
