@@ -245,8 +245,13 @@ def test_topics_that_are_missing(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="no image topic /gone with messages"):
         open_recording(path, "/gone")
     (tmp_path / "none").mkdir()
-    with pytest.raises(PerceptionError, match="it has no image topic"):
+    with pytest.raises(
+        PerceptionError, match=rf"has no image topic: it has {INFO} .sensor_msgs/msg/CameraInfo.; record"
+    ):
         open_recording(bag_of(tmp_path / "none", []))
+    (tmp_path / "depth").mkdir()
+    with pytest.raises(PerceptionError, match="it has no image topic"):
+        open_recording(bag_of(tmp_path / "depth", [Said(DEPTH, 5.0, steps_of(depth_of(1)[0]), "16UC1")]))
 
 
 def test_time_stamps(tmp_path: Path) -> None:

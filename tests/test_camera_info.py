@@ -31,6 +31,8 @@ def info(topic: str = "/cam/camera_info", frame: str = "cam", **changed: Any) ->
         ("plumb_bob", 0),
         ("plumb_bob", 4),
         ("plumb_bob", 5),
+        ("plumb_bob", 8),
+        ("radtan", 4),
         ("rational_polynomial", 5),
         ("rational_polynomial", 8),
         ("rational_polynomial", 12),
@@ -60,8 +62,9 @@ def test_a_fisheye_lens_bends_without_coefficients_too() -> None:
 
 
 def test_zeros_at_the_end_change_nothing() -> None:
-    long = camera_of(IMAGES, [info(d=[*LENS[:4], 0, 0, 0, 0])])
-    assert long == camera_of(IMAGES, [info(d=LENS[:4])])
+    for model in ("radtan", "equidistant"):
+        short, long = (info(d=LENS[:4] + more, distortion_model=model) for more in ([], [0.0] * 4))
+        assert camera_of(IMAGES, [long]) == camera_of(IMAGES, [short])
 
 
 @pytest.mark.parametrize(
@@ -72,9 +75,9 @@ def test_zeros_at_the_end_change_nothing() -> None:
         ({"k": [np.nan, *K[1:]]}, "fx = nan"),
         ({"k": [-500.0, *K[1:]]}, "fx = -500.0, it must be positive"),
         ({"k": [500.0, 3.0, *K[2:]]}, "skew is 3 pixels"),
-        ({"d": LENS[:3]}, r"plumb_bob with coefficients \[-0.3, 0.1, 0.001\]: it has 4 or 5"),
-        ({"d": LENS[:8]}, "it has 4 or 5 finite ones"),
-        ({"d": [np.nan] * 5}, "it has 4 or 5 finite ones"),
+        ({"d": LENS[:3]}, r"plumb_bob with coefficients \[-0.3, 0.1, 0.001\]: it has 4 or 5 or 8"),
+        ({"d": LENS[:8], "distortion_model": "radtan"}, "it has 4 or 5 finite ones"),
+        ({"d": [np.nan] * 5}, "14 finite ones"),
         ({"d": LENS[:5], "distortion_model": "equidistant"}, "equidistant .* it has 4 finite"),
         ({"d": LENS[:6], "distortion_model": "rational_polynomial"}, "it has 4 or 5 or 8 or 12 or 14"),
         ({"d": LENS[:4], "distortion_model": ""}, "no distortion model has coefficients"),

@@ -63,7 +63,7 @@ def import_recording(
     if taken_by is None:
         reason = f" ({opened.no_camera})" if opened.no_camera else ""
         raise PerceptionError(
-            f"{recording} names no camera{reason}: give --camera, made by `foretrace calibrate`"
+            f"{recording} names no camera{reason}: give --camera, a file of `foretrace calibrate`, ROS or Kalibr"
         )
     layout = markers or opened.beside(MARKERS)
     if layout is None:

@@ -9,7 +9,7 @@ import yaml
 
 from foretrace.errors import PerceptionError
 from foretrace.files import read_text
-from foretrace.interactions.lens_models import FISHEYE, lens_of
+from foretrace.interactions.lens_models import FISHEYE, OPENCV, lens_of
 
 REMEDY = "give a camera file of `foretrace calibrate`, ROS (ost.yaml), OpenCV or Kalibr"
 LARGEST = 1 << 20
@@ -50,7 +50,7 @@ def read_camera_yaml(path: Path) -> dict[str, Any]:
     try:
         return _kalibr(next(iter(several.values()))) if several else _ros_or_opencv(content)
     except PerceptionError as error:
-        raise PerceptionError(f"{path}: {error}") from error
+        raise PerceptionError(f"{path}: {error}: {REMEDY}") from error
     except KeyError as error:
         raise PerceptionError(f"{path} lacks {error.args[0]}: {REMEDY}") from error
     except (TypeError, ValueError) as error:
@@ -85,15 +85,13 @@ def _ros_or_opencv(content: Mapping[str, Any]) -> dict[str, Any]:
     matrix, lens = _matrix(found["matrix"]), _matrix(found["distortion"])
     model = found["model"]
     if model is None:  # OpenCV: the number of coefficients tells the model, but for the fisheye one
-        model = FISHEYE[0] if small.get("fisheye_model") else "rational_polynomial"
+        model = FISHEYE[0] if small.get("fisheye_model") else OPENCV[0]
     return _camera(found["width"], found["height"], matrix, str(model), lens)
 
 
 def _kalibr(content: Mapping[str, Any]) -> dict[str, Any]:
     if (kind := content.get("camera_model")) != "pinhole":
-        raise PerceptionError(
-            f"camera model {str(kind)[:40]!r}: of Kalibr's, pinhole can be read; calibrate as that"
-        )
+        raise PerceptionError(f"camera model {str(kind)[:40]!r}, of Kalibr's models pinhole can be read")
     fx, fy, cx, cy = (float(value) for value in content["intrinsics"])
     width, height = content["resolution"]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -108,10 +106,10 @@ def _matrix(value: Any) -> np.ndarray:
 
 def _camera(width: Any, height: Any, matrix: np.ndarray, model: str, lens: np.ndarray) -> dict[str, Any]:
     if matrix.size != 9:
-        raise PerceptionError(f"a camera matrix of {matrix.size} numbers, it has 9: {REMEDY}")
+        raise PerceptionError(f"a camera matrix of {matrix.size} numbers, it has 9")
     matrix = matrix.reshape(3, 3)
     if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
-        raise PerceptionError(f"a skew of {matrix[0, 1]:g} pixels: calibrate without skew")
+        raise PerceptionError(f"a skew of {matrix[0, 1]:g} pixels, which cannot be used")
     distortion, fisheye = lens_of(model, lens.ravel().tolist())
     return {
         "width": int(width),

@@ -6,18 +6,17 @@ import numpy as np
 
 from foretrace.errors import PerceptionError
 
-BROWN = ("plumb_bob", "radtan", "brown_conrady")
-RATIONAL = ("rational_polynomial",)
+OPENCV = ("plumb_bob", "rational_polynomial")
+BROWN = ("radtan", "brown_conrady")
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
 STRAIGHT = ("", "none")
 SIZES = (
-    dict.fromkeys(BROWN, (4, 5))
-    | dict.fromkeys(RATIONAL, (4, 5, 8, 12, 14))
+    dict.fromkeys(OPENCV, (4, 5, 8, 12, 14))
+    | dict.fromkeys(BROWN, (4, 5))
     | dict.fromkeys(FISHEYE, (4,))
     | dict.fromkeys(STRAIGHT, (0,))
 )
 """How many coefficients each model can have."""
-REMEDY = "rectify the images, or give a camera file made by `foretrace calibrate`"
 
 
 def lens_of(model: str, coefficients: Sequence[float]) -> tuple[tuple[float, ...], bool]:
@@ -28,17 +27,18 @@ def lens_of(model: str, coefficients: Sequence[float]) -> tuple[tuple[float, ...
         coefficients: Its coefficients; zeros at the end may be left out or be too many.
 
     Raises:
-        PerceptionError: The model is not known, or its coefficients are not as many as it has.
+        PerceptionError: The model is not known, or its coefficients are not as many as it has; what to do is the
+            caller's to say.
     """
     name = "_".join(model.lower().replace("-", " ").split())
     values = np.asarray(coefficients, dtype=float).ravel()
     bent = bool((values != 0).any())  # NaN counts
     if name in STRAIGHT and bent:
         said = f"the distortion model {model!r}" if name else "no distortion model"
-        raise PerceptionError(f"{said} has coefficients {_few(values)}: {REMEDY}")
+        raise PerceptionError(f"{said} has coefficients {_few(values)}")
     if name not in SIZES:
         raise PerceptionError(
-            f"distortion model {model[:40]!r} is none of {', '.join((*BROWN, *RATIONAL, *FISHEYE))}: {REMEDY}"
+            f"distortion model {model[:40]!r} is none of {', '.join((*OPENCV, *BROWN, *FISHEYE))}"
         )
     if not bent:  # a fisheye lens bends with zeros, too
         return ((0.0,) * 4, True) if name in FISHEYE else ((), False)
@@ -48,7 +48,7 @@ def lens_of(model: str, coefficients: Sequence[float]) -> tuple[tuple[float, ...
     if len(values) not in sizes or not np.isfinite(values).all():
         counts = " or ".join(str(size) for size in sizes)
         raise PerceptionError(
-            f"distortion model {name} with coefficients {_few(values)}: it has {counts} finite ones; {REMEDY}"
+            f"distortion model {name} with coefficients {_few(values)}: it has {counts} finite ones"
         )
     return tuple(float(value) for value in values), name in FISHEYE
 

@@ -72,6 +72,8 @@ def open_bag(path: Path, topic: str | None = None, depth_topic: str | None = Non
         streams = _streams(reader, path)
         colours = [name for name, stream in streams.items() if not stream.depth]
         depths = [name for name, stream in streams.items() if stream.depth]
+        if not streams:
+            raise PerceptionError(f"bag {path} has no image topic: it has {_contents(reader)}")
         colour = _chosen(path, topic, colours, "image topic", "--topic")
         frame = streams[colour].frame
         aligned = [name for name in depths if streams[name].frame == frame and (frame or name == depth_topic)]
@@ -95,6 +97,13 @@ def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
             found[topic] = _Stream(is_depth(message), message.header.frame_id, message)
             break
     return found
+
+
+def _contents(reader: Any) -> str:
+    """What a bag has, in words: images may be of a kind that is not read, such as video."""
+    topics = sorted({(c.topic, c.msgtype) for c in reader.connections})
+    shown = ", ".join(f"{topic} ({kind})" for topic, kind in topics[:4]) or "nothing"
+    return f"{shown}{' and more' if len(topics) > 4 else ''}; record images raw or as JPEG or PNG"
 
 
 def _chosen(path: Path, asked: str | None, topics: list[str], kind: str, option: str) -> str:
