@@ -35,6 +35,8 @@ class Notes(TypedDict):
     """Path of the recording, seen from the data set."""
     recording_path: NotRequired[str]
     """Its absolute path."""
+    topic: NotRequired[str | None]
+    """Topic of its images that was asked for, of a bag."""
     camera: dict[str, Any]
     """Its camera."""
     T_action_camera: Transform
