@@ -174,6 +174,20 @@ def test_depth_images_are_read_in_their_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_depth(tmp_path / "depth.png"), [[0.05, 0.0], [0.0, 0.125]])
 
 
+def test_depth_images_of_other_kinds(tmp_path: Path) -> None:
+    metres = np.array([[0.5, 0.0], [np.nan, 1.25]], np.float32)
+    cv2.imwrite(str(tmp_path / "depth.tif"), metres)
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tif"), [[0.5, 0.0], [0.0, 1.25]])
+    np.save(tmp_path / "depth.npy", np.array([[500, 0], [0, 1250]], np.uint16).T)
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.npy"), [[0.5, 0.0], [0.0, 1.25]])
+    for values in (metres * 1000, metres / 1000):
+        np.save(tmp_path / "depth.npy", values)
+        with pytest.raises(
+            PerceptionError, match=r"median depth of \S+ m, in units of 1 m: write fractions in m"
+        ):
+            read_depth(tmp_path / "depth.npy")
+
+
 @pytest.mark.parametrize("content", [None, b"", "eight bits", "three numbers", "objects"])
 def test_what_is_no_depth_image_is_refused(tmp_path: Path, content: str | bytes | None) -> None:
     file = tmp_path / ("depth.npy" if content in ("three numbers", "objects") else "depth.png")

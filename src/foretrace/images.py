@@ -127,11 +127,13 @@ def read_colour(path: str | Path, error: type[ForetraceError]) -> UInt8[np.ndarr
     return read_image(path, error).bgr(path, error)
 
 
-def check_pixels(source: str | Path, rows: int, columns: int, error: type[ForetraceError]) -> None:
-    """Refuse an image of more than `MOST_PIXELS` pixels, by an error of the given class."""
-    if rows * columns > MOST_PIXELS:
+def check_pixels(
+    source: str | Path, rows: int, columns: int, error: type[ForetraceError], most: int = MOST_PIXELS
+) -> None:
+    """Refuse an image of more pixels than can be worked with, by an error of the given class."""
+    if rows * columns > most:
         raise error(
-            f"{source} has {columns} x {rows} pixels: scale it down to {MOST_PIXELS / 1e6:.0f} million at most"
+            f"{source} has {columns} x {rows} pixels: scale it down to {most / 1e6:.0f} million at most"
         )
 
 

@@ -9,7 +9,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, NotRequired, TypedDict
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import cv2
 import numpy as np
@@ -32,6 +32,8 @@ CAMERA, MARKERS, NOTES, BACKGROUND, OBJECT = (
 )
 DEPTH_UNIT = 0.0001
 """Unit of the depth images that are written [m]."""
+NEAREST, FARTHEST = 0.01, 20.0
+"""Median depths beyond are of another unit [m]."""
 JPEG_QUALITY = 95
 
 
@@ -93,31 +95,41 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "rows columns 3"]:
 def read_depth(path: Path) -> Float[np.ndarray, "rows columns"]:
     """A depth image [m], 0 where nothing was measured.
 
-    From a 16-bit PNG in millimetres (or in the unit that the notes beside it name), or a ``.npy`` array in metres.
+    From a PNG or TIFF, or a ``.npy`` array: whole numbers in millimetres, or in the unit that the notes beside it name,
+    fractions in metres (REP 118).
 
     Raises:
-        PerceptionError: It is missing, cannot be read, or is no such image.
+        PerceptionError: It is missing, cannot be read, is no such image, or its unit cannot be right.
     """
     remedy = "give a PNG of 16 bits per pixel in millimetres, or a .npy array (rows, columns) in metres"
     if not path.is_file():
         raise PerceptionError(f"depth image {path} does not exist: {remedy}")
     if path.suffix.lower() == ".npy":
         try:
-            metres = np.asarray(np.load(path, allow_pickle=False), dtype=float)
-        except (OSError, ValueError, TypeError) as error:
+            values: Any = np.load(path, allow_pickle=False, mmap_mode="r")  # whose size is that of the file
+        except (OSError, ValueError, TypeError, EOFError) as error:
             raise PerceptionError(f"cannot read a depth image from {path} ({error}): {remedy}") from error
     else:
-        steps = images.read_image(path, PerceptionError, remedy=remedy).values
-        if steps.dtype != np.uint16:
-            raise PerceptionError(
-                f"cannot read a depth image from {path}, which holds an image of {steps.dtype}: {remedy}"
-            )
-        metres = steps * RecordingNotes.load(path.parent).depth_unit
-    if metres.ndim != 2:
+        values = images.read_image(path, PerceptionError, remedy=remedy).values
+    if getattr(values, "ndim", 0) != 2:
         raise PerceptionError(
-            f"{path} has shape {metres.shape}, a depth image has rows and columns: {remedy}"
+            f"{path} has shape {np.shape(values)}, a depth image has rows and columns: {remedy}"
         )
-    return np.where(np.isfinite(metres) & (metres > 0), metres, 0.0)
+    if values.dtype.kind not in "iuf" or values.dtype.itemsize < 2:
+        raise PerceptionError(
+            f"cannot read a depth image from {path}, which holds an image of {values.dtype}: {remedy}"
+        )
+    images.check_pixels(path, values.shape[0], values.shape[1], PerceptionError)
+    unit = 1.0 if values.dtype.kind == "f" else RecordingNotes.load(path.parent).depth_unit
+    metres = np.array(values, dtype=float) * unit
+    metres = np.where(np.isfinite(metres) & (metres > 0), metres, 0.0)
+    usual = float(np.median(metres[metres > 0])) if metres.any() else NEAREST
+    if not NEAREST <= usual <= FARTHEST:
+        raise PerceptionError(
+            f"{path} has a median depth of {usual:.3g} m, in units of {unit:g} m: write fractions in metres or whole "
+            f"numbers in millimetres, or name their depth_unit in {NOTES}"
+        )
+    return metres
 
 
 def write_image(path: Path, image: np.ndarray, options: Sequence[int] = ()) -> None:

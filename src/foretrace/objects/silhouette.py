@@ -21,8 +21,8 @@ INVERT = "invert it (--invert, or read_silhouette(mask, invert=True))"
 """Remedy for an object that is black on white."""
 LARGE_HOLE = 0.02
 """A hole of this share of the object's area may be the object itself, drawn black on white."""
-RECTANGLE = 0.8
-"""An outline that fills this share of the smallest rectangle round it may be a page; of a circle it is 0.785."""
+RECTANGLE = 0.9
+"""An outline that fills this share of the smallest rectangle round it may be a page."""
 TOLERANCE = 0.001
 """How far a polygon may leave the outline that it simplifies [m]."""
 TOLERANCE_PIXELS = 0.75
@@ -40,6 +40,8 @@ LEAST_SINE = 0.17
 """Corners sharper than 20 degrees are put back no further than one of these."""
 FINEST, COARSEST = 1e-6, 0.1
 """Sides of the smallest and of the largest pixels of images [m]."""
+MOST_PIXELS = 40_000_000
+"""Larger masks are refused: an outline needs no more, and they would take seconds and gigabytes."""
 LIKELY_SIZES = (0.02, 0.4)
 """Objects that are levered are no smaller and no larger, as a rule [m]."""
 LOST_AREA = 0.03
@@ -65,7 +67,7 @@ def read_silhouette(
         raise ShapeError(f"mask of type {type(mask).__name__}: give an array of numbers, rows x columns")
     if mask.ndim != 2:
         raise ShapeError(f"mask has shape {mask.shape}: give one channel, rows x columns")
-    check_pixels("mask", mask.shape[0], mask.shape[1], ShapeError)
+    check_pixels("mask", mask.shape[0], mask.shape[1], ShapeError, MOST_PIXELS)
     return _one_object(object_pixels(StoredImage(mask), label, invert))
 
 
