@@ -87,6 +87,7 @@ def test_a_file_of_opencv(tmp_path: Path, header: str, count: int) -> None:
         ("a: 1", "lacks image_width"),
         (OST.replace("camera_matrix", "matrix"), "lacks camera_matrix"),
         (OST.replace("512.25, 0", "512.25, x"), "a value that is no number"),
+        (OST.replace("image_width: 640", "image_width: .inf"), "a value that is no number"),
         (OST.replace("512.25, 0", "512.25, 7"), "a skew of 7 pixels"),
         (OST.replace("512.25, 0", "512.25"), "camera matrix of 8 numbers"),
         (

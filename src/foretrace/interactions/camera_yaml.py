@@ -53,7 +53,7 @@ def read_camera_yaml(path: Path) -> dict[str, Any]:
         raise PerceptionError(f"{path}: {error}: {REMEDY}") from error
     except KeyError as error:
         raise PerceptionError(f"{path} lacks {error.args[0]}: {REMEDY}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise PerceptionError(
             f"{path} has a value that is no number ({str(error)[:60]}): {REMEDY}"
         ) from error

@@ -26,6 +26,7 @@ MCAP_HEADER = 17
 """Place of the profile's name in an MCAP file."""
 FAULTS = {
     "Profile is not": "it is of ROS 1 or no recording of ROS; give one of ROS 2, or the .bag of ROS 1",
+    "Unrecognized storage": "give it an ending in small letters: .mcap, .db3 or .bag",
     "timestamp order": "sort it with `mcap sort`",
     "KeyError": "it has messages that are not of ROS 2; leave them out with `mcap filter`",
     "not indexed": "it was never closed; repair it with `rosbag reindex`",

@@ -63,7 +63,7 @@ def video_frames(path: Path) -> Iterator[Frame]:
     """
     time, end = None, 0.0
     try:
-        with open(path, "rb") as file, av.open(file, mode="r") as video:
+        with open(path, "rb") as file, av.open(file, mode="r", metadata_errors="replace") as video:
             films = [one for one in video.streams.video if not one.disposition & Disposition.attached_pic]
             if not films:
                 raise PerceptionError(f"video {path} has no moving images: give the file that has them")
@@ -83,8 +83,8 @@ def video_frames(path: Path) -> Iterator[Frame]:
                     yield Frame(time, frame.to_ndarray(format="bgr24"))
             if time is not None and end < _stated_end(films[0].metadata) - SLACK:
                 raise _damaged(path, time, "the images after that are missing")
-    except (OSError, av.error.FFmpegError) as error:
-        raise _damaged(path, time, error.strerror or str(error)) from error
+    except (OSError, ValueError, av.error.FFmpegError) as error:
+        raise _damaged(path, time, getattr(error, "strerror", None) or str(error)) from error
     if time is None:
         raise _damaged(path, time, "no image")
 
