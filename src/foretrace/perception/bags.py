@@ -173,7 +173,7 @@ def _damaged(path: Path, error: Exception) -> PerceptionError:
     remedy = (
         known or f"it is cut off, was never closed or is no bag; copy it again, or repair it with {repair}"
     )
-    return PerceptionError(f"bag {path} cannot be read ({error}): {remedy}")
+    return PerceptionError(f"bag {path} cannot be read ({' '.join(str(error).split())[:120]}): {remedy}")
 
 
 def _messages(reader: Any, path: Path, topics: list[str]) -> Iterator[tuple[str, float, Any]]:
