@@ -39,7 +39,9 @@ class ObjectOptions:
     invert: bool = False
     """The image shows the object black on white."""
     mesh: Path | None = None
-    """STL or OBJ file of the object."""
+    """STL, OBJ, PLY or OFF file of the object."""
+    rest: bool = False
+    """Turn the mesh onto the side on which its centre of mass is lowest, where it does not stand right in its file."""
     scale: float | None = None
     """Metres per pixel of the image, or per unit of the mesh or polygon, 1 by default."""
     height: float | None = None
@@ -63,6 +65,8 @@ class ObjectOptions:
             raise PredictionError(
                 f"{' and '.join(given) or 'no object'} given: give exactly one of --polygon, --image, --mesh"
             )
+        if self.rest and self.mesh is None:
+            raise PredictionError("--rest goes with --mesh: the others lie flat already")
         if self.height is not None and self.mesh is not None:
             raise PredictionError("--height goes with --polygon and --image: a mesh has its own")
         if self.image is None and (self.label is not None or self.invert):
@@ -71,7 +75,7 @@ class ObjectOptions:
         if self.polygon is not None:
             return Prism(read_polygon(self.polygon, self.scale), height), None
         if self.mesh is not None:
-            return MeshObject.load(self.mesh, 1.0 if self.scale is None else self.scale), None
+            return MeshObject.load(self.mesh, 1.0 if self.scale is None else self.scale, rest=self.rest), None
         if self.scale is None or self.image is None:
             raise PredictionError("--image needs --scale, the metres per pixel")
         mask = read_silhouette_image(self.image, self._label(), self.invert)

@@ -35,6 +35,8 @@ def import_recording(
     camera: Path | None = None,
     markers: Path | None = None,
     object: Path | None = None,
+    scale: float | None = None,
+    rest: bool = False,
     topic: str | None = None,
     depth_topic: str | None = None,
 ) -> None:
@@ -52,8 +54,10 @@ def import_recording(
         camera: The camera's file, JSON or YAML of ROS, OpenCV or Kalibr; by default camera.json beside the recording,
             or what a bag or a RealSense recording has.
         markers: Marker layout; by default markers.json beside the recording.
-        object: The object's shape: a .json file from `to_dict`, an .stl or .obj mesh, or a text file with the outline's
-            corners. Without it, the prism that its outline in the first frame shows.
+        object: The object's shape: a .json file from `to_dict`, a mesh (.stl, .obj, .ply, .off), or a text file with
+            the outline's corners. Without it, the prism that its outline in the first frame shows.
+        scale: Metres per unit of the object's mesh or outline, 1 by default.
+        rest: Turn a mesh onto the side on which its centre of mass is lowest.
         topic: Image topic of a bag, if it has several.
         depth_topic: Depth topic of a bag, aligned with the images; by default the one in the same frame, if any.
     """
@@ -69,7 +73,9 @@ def import_recording(
     if layout is None:
         raise PerceptionError(f"{recording} has no {MARKERS} beside it: give --markers")
     where = Contact(at.contact, contact_px, at.share)
-    shape = None if object is None else read_shape(object, config.height)
+    if object is None and (scale is not None or rest):
+        raise PerceptionError("--scale and --rest go with --object: give one, or leave them out")
+    shape = None if object is None else read_shape(object, config.height, scale, rest)
     found = importing.import_recording(opened, taken_by, MarkerLayout.load(layout), where, shape, config)
     id = add_recorded(
         out, found.interaction, _notes(place_of(recording, out) | {"topic": topic}, taken_by, found)

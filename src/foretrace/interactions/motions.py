@@ -14,6 +14,7 @@ from foretrace.files import read_versioned
 from foretrace.geometry import continuous_quaternions
 from foretrace.objects import NO_BEVEL, MassProperties, Prism
 from foretrace.objects.body import Body
+from foretrace.objects.mesh_files import read_mesh
 from foretrace.schema import Finite, Pose, Positive, Vector2, Vector3, conform
 from foretrace.trajectories import check_poses
 
@@ -232,12 +233,5 @@ def _uniform(shape: Mapping[str, Any], kind: str, mass: float, folder: Path) -> 
         return Body.of(prism, mass / prism.mass_properties(1.0).mass)
     if kind == "hull":
         return Body.hull(np.array(shape["vertices"], dtype=float), mass)
-    import trimesh
-
-    file = folder / shape["file"]
-    try:
-        mesh = trimesh.load_mesh(file)
-        vertices = np.array(mesh.vertices, dtype=float) * shape.get("scale", 1.0)
-    except Exception as error:  # trimesh's readers raise whatever the file makes them stumble over
-        raise DatasetError(f"mesh file {file} cannot be read ({error}): give an STL or OBJ file") from error
-    return Body.hull(vertices, mass)
+    vertices, _ = read_mesh(folder / shape["file"], DatasetError)
+    return Body.hull(vertices * shape.get("scale", 1.0), mass)

@@ -10,28 +10,40 @@ from foretrace.errors import ShapeError
 from foretrace.files import read_json
 from foretrace.images import read_image
 from foretrace.objects import MeshObject, ObjectModel, Prism, object_from_dict
+<<<<<<< HEAD
 from foretrace.objects.object_pixels import Label, object_pixels
+=======
+from foretrace.objects.mesh_files import is_mesh_file
+>>>>>>> 54b6a5f (Meshes are cut exactly, united where their bodies touch, and read in their unit; --rest puts them down)
 from foretrace.objects.polygon_files import read_polygon
 from foretrace.objects.prism import DEFAULT_HEIGHT
 
 
-def read_shape(path: Path, height: float | None = None) -> ObjectModel:
-    """An object from a description (``.json``, from ``to_dict``), a mesh (``.stl``, ``.obj``) or an outline (others).
+def read_shape(
+    path: Path, height: float | None = None, scale: float | None = None, rest: bool = False
+) -> ObjectModel:
+    """An object from a file.
 
     Args:
-        path: The file.
+        path: A description (``.json``, from ``to_dict``), a mesh (STL, OBJ, PLY, OFF), or else an outline.
         height: Height of an outline's prism [m]; 0.02 by default.
+        scale: Metres per unit of a mesh or an outline; 1 by default.
+        rest: Whether to turn a mesh onto the side on which its centre of mass is lowest.
 
     Raises:
         ShapeError: The file is missing, damaged, or describes no usable object.
     """
-    if path.suffix.lower() in (".stl", ".obj"):
-        return MeshObject.load(path)
+    if is_mesh_file(path):
+        return MeshObject.load(path, 1.0 if scale is None else scale, rest=rest)
+    if rest:
+        raise ShapeError(f"{path} is no mesh and lies as it should: leave out --rest")
     if path.suffix.lower() == ".json":
         content = read_json(path, dict[str, Any], ShapeError, "give an object's to_dict() as JSON")
         if "type" not in content:  # GeoJSON names its type, an object its kind
+            if scale is not None:
+                raise ShapeError(f"{path} describes an object in metres: leave out --scale")
             return object_from_dict(content)
-    return Prism(read_polygon(path), DEFAULT_HEIGHT if height is None else height)
+    return Prism(read_polygon(path, scale), DEFAULT_HEIGHT if height is None else height)
 
 
 def read_silhouette_image(

@@ -19,7 +19,7 @@ from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, PredictionError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
-from foretrace.objects import ObjectModel
+from foretrace.objects import MeshObject, ObjectModel
 from foretrace.pictures.bands import PredictionBand
 from foretrace.pictures.style import (
     CM,
@@ -306,6 +306,8 @@ def draw_over_time(axes: list[Axes], scene: Scene) -> None:
 def silhouette(obj: ObjectModel, pose: Float[np.ndarray, "7"]) -> list[Float[np.ndarray, "_ 2"]]:
     """Outlines of an object seen from the side: closed rings of x and z in the action frame [m]."""
     transform = pose_to_matrix(pose)
+    if isinstance(obj, MeshObject):
+        return obj.side_view(transform)
     hulls = [
         shapely.MultiPoint(transform_points(transform, piece)[:, [0, 2]]).convex_hull
         for piece in obj.convex_pieces()
