@@ -61,6 +61,8 @@ def import_recording(
         topic: Image topic of a bag, if it has several.
         depth_topic: Depth topic of a bag, aligned with the images; by default the one in the same frame, if any.
     """
+    if object is None and (scale is not None or rest):
+        raise PerceptionError("--scale and --rest go with --object: give one, or leave them out")
     opened = open_recording(recording, topic, depth_topic)
     intrinsics = camera or (None if opened.camera is not None else opened.beside(CAMERA))
     taken_by = opened.camera if intrinsics is None else PinholeCamera.load(intrinsics)
@@ -73,8 +75,6 @@ def import_recording(
     if layout is None:
         raise PerceptionError(f"{recording} has no {MARKERS} beside it: give --markers")
     where = Contact(at.contact, contact_px, at.share)
-    if object is None and (scale is not None or rest):
-        raise PerceptionError("--scale and --rest go with --object: give one, or leave them out")
     shape = None if object is None else read_shape(object, config.height, scale, rest)
     found = importing.import_recording(opened, taken_by, MarkerLayout.load(layout), where, shape, config)
     id = add_recorded(

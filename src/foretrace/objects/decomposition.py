@@ -34,7 +34,7 @@ VERSION = b"plane cuts, 1"
 """Named in the cache: another way to cut has another one."""
 
 Points = Float[np.ndarray, "_ 3"]
-Faces = Int[np.ndarray, "f 3"]
+Faces = Int[np.ndarray, "_ 3"]
 
 
 def as_solid(vertices: Points, faces: Faces) -> Any:

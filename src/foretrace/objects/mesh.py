@@ -157,7 +157,7 @@ class MeshObject(ObjectModel):
 
     def side_view(self, T_view_object: Float[np.ndarray, "4 4"]) -> list[Float[np.ndarray, "_ 2"]]:
         """Outlines of the mesh, bevelled, seen along the y axis of a view: closed rings of x and z [m]."""
-        turned = self._bevelled.transform(T_view_object[[0, 2, 1], :] * [[1.0], [1.0], [-1.0]])
+        turned = as_solid(*self._bevelled).transform(T_view_object[[0, 2, 1], :] * [[1.0], [1.0], [-1.0]])
         rings = [np.asarray(ring) for ring in turned.project().to_polygons()]
         return [np.concatenate([ring, ring[:1]]) for ring in rings if polygon_area(ring) > 0]
 
@@ -196,10 +196,6 @@ class MeshObject(ObjectModel):
         return is_convex_body(self._mesh)
 
     @cached_property
-    def _solid(self) -> Any:
-        return as_solid(self.vertices, self.faces)
-
-    @cached_property
     def _chamfer(self) -> list[tuple[Float[np.ndarray, "3"], float]]:
         """Normal n and offset of the planes ``n . x >= offset`` below which the body recedes."""
         if self.bevel.height == 0:
@@ -212,12 +208,13 @@ class MeshObject(ObjectModel):
         ]
 
     @cached_property
-    def _bevelled(self) -> Any:
-        solid = self._solid
+    def _bevelled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces of the bevelled mesh. Its solid is not kept: it could not be sent to another process."""
+        solid = as_solid(self.vertices, self.faces)
         for normal, offset in self._chamfer:
             length = float(np.linalg.norm(normal))
             solid = solid.trim_by_plane(tuple(normal / length), offset / length)
-        return solid
+        return surface_of(solid)
 
     @cached_property
     def _pieces(self) -> list[np.ndarray]:
@@ -231,7 +228,7 @@ class MeshObject(ObjectModel):
                 hull = ConvexHull(piece)
                 bevelled.append(read_only(piece[hull.vertices]))
                 volume += hull.volume
-        fault = (volume - self._bevelled.volume()) / self._solid.volume()
+        fault = (volume - as_solid(*self._bevelled).volume()) / float(self._mesh.volume)
         if not abs(fault) <= VOLUME_TOLERANCE:
             raise ShapeError(
                 f"mesh of which {len(pieces)} convex pieces miss the volume by {100 * fault:+.2g} %: thin curved walls "
@@ -242,7 +239,7 @@ class MeshObject(ObjectModel):
     @cached_property
     def support_corners(self) -> Float[np.ndarray, "n 2"]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The footprint's point nearest to each corner of the outline, in the object frame [m]."""
-        points = self._pieces[0] if self._convex else surface_of(self._bevelled)[0]
+        points = self._pieces[0] if self._convex else self._bevelled[0]
         lowest = points[:, 2].min()
         foot = shapely.MultiPoint(points[points[:, 2] < lowest + FOOT_HEIGHT, :2]).convex_hull
         return read_only(

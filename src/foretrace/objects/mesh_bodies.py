@@ -10,10 +10,13 @@ from scipy.spatial import ConvexHull
 from foretrace.errors import ShapeError
 from foretrace.objects.decomposition import Faces, Points, as_solid, surface_of
 
+NO_VOLUME = "mesh encloses no volume: give the surface of a closed body"
 DEBRIS = 1e-3
 """Loose shells below this share of the volume are left out."""
-TOUCHING = 1e-6
-"""Bodies nearer than this share of the mesh's size touch: it is the rounding of an STL file."""
+TOUCHING = 2e-6
+"""Bodies nearer than this share of the mesh's size may touch: an STL file's rounding is smaller."""
+SMALLEST_FACE = 2e-5
+"""Smallest face by which bodies touch, relative to the square of the mesh's size."""
 LINES = 64
 """Vertical lines along each axis on which the mesh is looked at for crossing itself."""
 LARGEST_FAULT = 1e-3
@@ -40,6 +43,8 @@ def one_solid(vertices: Points, faces: Faces) -> tuple[Points, Faces]:
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     plain = mesh.is_watertight and mesh.is_winding_consistent
+    if plain and abs(mesh.volume) < 1e-9 * np.ptp(vertices, axis=0).max() ** 3:
+        raise ShapeError(NO_VOLUME)
     if plain and is_convex_body(mesh):
         return vertices, faces if mesh.volume > 0 else faces[:, ::-1]
     solid = as_solid(vertices, faces)
@@ -53,7 +58,12 @@ def one_solid(vertices: Points, faces: Faces) -> tuple[Points, Faces]:
     if plain and len(shells) == 1:
         faces = faces if mesh.volume > 0 else faces[:, ::-1]
     else:
-        vertices, faces = _united(vertices, faces, shells)
+        # Faces that coincide but for rounding are cut anew once or twice; then a stored mesh comes back as it was.
+        for _ in range(4):
+            before = vertices, faces
+            vertices, faces = _united(vertices, faces, as_solid(vertices, faces).decompose())
+            if np.array_equal(before[0], vertices) and np.array_equal(before[1], faces):
+                break
     if (fault := _crossing_share(vertices[faces])) > LARGEST_FAULT:
         raise ShapeError(
             f"mesh crosses itself: {100 * fault:.2g} % of its volume is bounded twice or inside out; "
@@ -87,6 +97,8 @@ def _united(vertices: Points, faces: Faces, shells: list[Any]) -> tuple[Points, 
     whole = sum(abs(volume) for volume in volumes)
     kept = [(shell, v) for shell, v in zip(shells, volumes, strict=True) if abs(v) > 1e-9 * whole]
     bodies = [shell for shell, v in kept if v > 0]
+    if not kept:
+        raise ShapeError(NO_VOLUME)
     same = len(kept) == len(shells)
     cavities = [_inside_out(shell) for shell, v in kept if v < 0]
     for cavity in cavities:
@@ -102,7 +114,7 @@ def _united(vertices: Points, faces: Faces, shells: list[Any]) -> tuple[Points, 
     volume = solid.volume()
     large = [part for part in parts if part.volume() > DEBRIS * volume]
     if len(large) > 1:
-        large = _one_body(large)
+        _one_body(large)
     same = same and len(large) == len(parts) == len(bodies)
     if same and abs(volume - sum(v for _, v in kept)) < 1e-6 * whole:
         return vertices, faces[:, ::-1] if turned else faces
@@ -126,8 +138,8 @@ def _separate(solid: Any) -> list[Any]:
     return parts
 
 
-def _one_body(parts: list[Any]) -> list[Any]:
-    """The parts again, where each is within rounding of the next.
+def _one_body(parts: list[Any]) -> None:
+    """Check that each part touches the next with a face, but for rounding.
 
     Raises:
         ShapeError: They lie apart, or touch along an edge or in a corner only.
@@ -136,20 +148,28 @@ def _one_body(parts: list[Any]) -> list[Any]:
     size = float((high.max(axis=0) - low.min(axis=0)).max())
     reached, left = [parts[0]], parts[1:]
     while left:
-        gaps = [min(part.min_gap(other, 2 * size) for other in reached) for part in left]
-        nearest = int(np.argmin(gaps))
-        gap = gaps[nearest]
-        if not 0 < gap <= TOUCHING * size:
+        found = next((part for part in left if any(_touch(part, other, size) for other in reached)), None)
+        if found is None:
+            gap = min(part.min_gap(other, 2 * size) for part in left for other in reached) / size
             how = (
                 "touch only along edges or in corners"
-                if gap == 0
-                else f"lie apart, by {gap / size:.2g} of their extent"
+                if gap <= TOUCHING
+                else f"lie apart, by {gap:.2g} of their extent"
             )
             raise ShapeError(
                 f"mesh holds {len(parts)} bodies that {how}: give a file of one body, or join them in CAD"
             )
-        reached.append(left.pop(nearest))
-    return parts
+        left.remove(found)
+        reached.append(found)
+
+
+def _touch(one: Any, other: Any, size: float) -> bool:
+    """Whether two bodies share a face: moved against each other by a step, they overlap by its area times the step."""
+    step = TOUCHING * size
+    steps = step * np.concatenate([np.eye(3), -np.eye(3)])
+    return any(
+        (one ^ other.translate(tuple(each))).volume() > step * SMALLEST_FACE * size**2 for each in steps
+    )
 
 
 def _crossing_share(triangles: Float[np.ndarray, "f 3 3"]) -> float:

@@ -77,6 +77,8 @@ def read_mesh(path: Path, error: type[ForetraceError] = ShapeError) -> tuple[Poi
         raise error(
             f"mesh file {path}: {int(wrong.sum())} of its vertices are not finite numbers: export it again"
         )
+    if (far := float(np.abs(mesh.vertices).max())) > LARGEST_COORDINATE:
+        raise error(f"mesh file {path} reaches {far:.3g} units from the origin: export it again")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     vertices = np.array(mesh.vertices)
     return vertices, unfolded(vertices, np.array(mesh.faces, dtype=np.int64))
@@ -178,8 +180,6 @@ def check_precision(vertices: Points) -> None:
         ShapeError: The rounding is large beside the mesh.
     """
     far = float(np.abs(vertices).max())
-    if far > LARGEST_COORDINATE:
-        raise ShapeError(f"mesh reaches {far:.3g} units from the origin: export it again")
     step = float(np.spacing(np.float32(far)))
     smallest = float(np.ptp(vertices, axis=0).min())
     rounded = np.array_equal(vertices, vertices.astype(np.float32))

@@ -10,11 +10,8 @@ from foretrace.errors import ShapeError
 from foretrace.files import read_json
 from foretrace.images import read_image
 from foretrace.objects import MeshObject, ObjectModel, Prism, object_from_dict
-<<<<<<< HEAD
-from foretrace.objects.object_pixels import Label, object_pixels
-=======
 from foretrace.objects.mesh_files import is_mesh_file
->>>>>>> 54b6a5f (Meshes are cut exactly, united where their bodies touch, and read in their unit; --rest puts them down)
+from foretrace.objects.object_pixels import Label, object_pixels
 from foretrace.objects.polygon_files import read_polygon
 from foretrace.objects.prism import DEFAULT_HEIGHT
 
