@@ -181,7 +181,7 @@ def frames(change: Any) -> list[list[float]]:
             "entry object.size is [0.1, 0.1], a list of at least 3",
         ),
         ({"object": {"kind": "box", "size": [0.1, 0.0, 0.1]}}, "lengths in metres must be above 0"),
-        ({"object": {"kind": "mesh", "file": "gone.stl"}}, "gone.stl cannot be read"),
+        ({"object": {"kind": "mesh", "file": "gone.stl"}}, "gone.stl does not exist"),
         ({"object": {"kind": "hull", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}}, "enclose no volume"),
         ({"inertia": np.diag([1.0, 1.0, 3.0]).tolist()}, "no body has the principal inertia"),
         ({"times": TIMES[::-1].tolist()}, "times must rise: 0.966667 s follows 1 s"),
