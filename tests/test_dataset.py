@@ -344,7 +344,7 @@ def spoil_number(rows):
         ("com_trajectory", lambda rows: [rows[0][:-1], *rows[1:]], "interaction 8: com_trajectory has 179"),
         ("times", lambda rows: [rows[0][::-1], *rows[1:]], "interaction 8: its times do not rise"),
         ("outcome", lambda rows: ["gone", *rows[1:]], "unknown outcome 'gone'"),
-        ("density", lambda rows: [None, *rows[1:]], "interaction 8: density is not a number"),
+        ("density", lambda rows: [None, *rows[1:]], "interaction 8: density is missing"),
         ("id", lambda rows: [3, *rows[1:]], "duplicate ids [3]"),
         ("id", lambda rows: [100, *rows[1:]], "its ids do not run from 8 on without gaps"),
     ],

@@ -122,7 +122,7 @@ def conform(
         a_key = path.startswith("key` in `")
         steps = re.findall(r"\[\.\.\.\]|\[\d+\]|[^.\[\]$`]+", path.removeprefix("key` in `"))
         name, value = _entry(content, [*steps, "[...]"] if a_key else steps, schema)
-        value = name.rpartition(".")[2] if a_key else value
+        value = name.removeprefix(_entry(content, steps, schema)[0]).removeprefix(".") if a_key else value
         name = ".".join(filter(None, (entry, name)))
         if missing := re.search(r"missing required field `(.+)`", text):
             name = ".".join(filter(None, (name, missing[1])))

@@ -21,6 +21,7 @@ from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
 from foretrace.interactions.batch import batch_of, chosen_rows, common_times
 from foretrace.interactions.record import Interaction
+from foretrace.interactions.soundness import check_shard
 from foretrace.objects import ObjectModel, object_from_json
 from foretrace.schema import parse_json
 
@@ -70,7 +71,7 @@ class Dataset:
         """
         path = as_path(path, DatasetError)
         manifest = storage.read_manifest(path)
-        shards = _Shards(path, {name: entry.get("sha256") for name, entry in manifest["shards"].items()})
+        shards = _Shards(path, manifest["shards"])
         if missing := storage.missing_shards(manifest):
             warnings.warn(
                 f"{path} is not finished: {len(missing)} of {len(missing) + len(shards)} shards are missing; "
@@ -85,6 +86,11 @@ class Dataset:
         )
         empty = _encoded(storage.SCHEMA.empty_table().select(INDEX_COLUMNS))
         dataset = cls(shards, pa.concat_tables([empty, *tables]), places.reshape(-1, 2), manifest)
+        ids, counts = np.unique(dataset.ids, return_counts=True)
+        if (counts > 1).any():
+            raise DatasetError(
+                f"{path} has interaction {ids[counts > 1][0]} more than once: `foretrace data {path}` names the shards"
+            )
         return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
 
     def __repr__(self) -> str:
@@ -298,13 +304,13 @@ def _encoded(table: pa.Table) -> pa.Table:
 class _Shards:
     """Tables of a data set's shards, kept in memory if all of them fit; otherwise only the last one that was read."""
 
-    def __init__(self, path: Path, checksums: Mapping[str, str | None]):
+    def __init__(self, path: Path, entries: Mapping[str, storage.ShardEntry]):
         self.path = path
-        self._checksums = sorted(checksums.items())
+        self._entries = sorted(entries.items())
         self._kept: dict[int, pa.Table] = {}
 
     def __len__(self) -> int:
-        return len(self._checksums)
+        return len(self._entries)
 
     @cached_property
     def fit(self) -> bool:
@@ -319,8 +325,9 @@ class _Shards:
         """
         table = self._kept.get(number)
         if table is None:
-            name, checksum = self._checksums[number]
-            table = storage.read_shard(self.path, name, checksum, columns=columns)[0]
+            name, entry = self._entries[number]
+            table = storage.read_shard(self.path, name, entry.get("sha256"), columns=columns)[0]
+            check_shard(table, str(self.path / name), entry.get("rows"))
             if columns is None:
                 if not self.__dict__.get("fit", False):
                     self._kept.clear()

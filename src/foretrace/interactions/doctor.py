@@ -1,19 +1,20 @@
 """Is a data set whole and sound? What is not, and what of it can be repaired."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from foretrace.actions import FAILED, ToolPath
-from foretrace.errors import ActionError, DatasetError
+from foretrace.actions import ToolPath
+from foretrace.errors import ActionError, DatasetError, ShapeError, shown
 from foretrace.files import partial_files, remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.dataset import count_outcomes
-
-QUATERNION_TOLERANCE = 1e-6
+from foretrace.interactions.soundness import find_faults
+from foretrace.objects import object_from_json
 
 
 @dataclass(frozen=True)
@@ -60,28 +61,44 @@ def examine(path: str | Path, repair: bool = False) -> Diagnosis:
 
 
 def _examine(path: Path, repair: bool) -> Diagnosis:
-    manifest = storage.read_manifest(path)
     findings = list(_stray_files(path, repair))
+    try:
+        manifest = storage.read_manifest(path)
+    except DatasetError as error:
+        if repair or not (path / storage.MANIFEST).is_file():
+            raise
+        findings.append(Finding(storage.MANIFEST, str(error)))
+        manifest = None
     tables: dict[str, pa.Table] = {}
     on_disk = {f.relative_to(path).as_posix() for f in path.glob(f"{storage.SHARD_FOLDER}/shard-*.parquet")}
-    for name in sorted(on_disk | set(manifest["shards"])):
-        entry = manifest["shards"].get(name, {})
+    shards = {} if manifest is None else manifest["shards"]
+    for name in sorted(on_disk | set(shards)):
+        entry = shards.get(name, {})
         try:
             table, content = storage.read_shard(path, name, entry.get("sha256"))
         except DatasetError as error:
-            findings.append(_set_aside(path, name, manifest, str(error), repair))
+            findings.append(_set_aside(path, name, shards, str(error), repair))
             continue
         tables[name] = table
-        findings += _unsound_numbers(name, table)
-        findings += _out_of_range(name, table, manifest)
-        if "sha256" not in entry:
+        faults = list(_unsound_rows(name, table))
+        findings += faults
+        if manifest is None:
+            continue
+        findings += [] if faults else _out_of_range(name, table, manifest)
+        if entry.get("rows", table.num_rows) != table.num_rows:
+            findings.append(Finding(name, f"it has {table.num_rows} rows, the manifest says {entry['rows']}"))
+        if entry.get("sha256") is None:
             findings.append(Finding(name, "no checksum in the manifest (an interrupted run)", repair))
             if repair:
-                manifest["shards"][name] = storage.shard_entry(content, table)
-    findings += _unsound_ids(tables, manifest)
-    if repair:
+                shards[name] = storage.shard_entry(content, table)
+    if manifest is not None:
+        findings += _unsound_ids(tables, manifest)
+        findings += (
+            _unsound_notes(path, tables) if manifest["configuration"] == recorded.CONFIGURATION else []
+        )
+    if repair and manifest is not None:
         storage.write_manifest(path, manifest)
-    outcomes = [outcome for table in tables.values() for outcome in table["outcome"].to_pylist()]
+    outcomes = [outcome for table in tables.values() for outcome in table["outcome"].drop_null().to_pylist()]
     return Diagnosis(tuple(findings), len(outcomes), count_outcomes(outcomes))
 
 
@@ -91,64 +108,38 @@ def _stray_files(path: Path, repair: bool) -> Iterator[Finding]:
             yield Finding(str(file.relative_to(path)), "temporary file of an interrupted run", repair)
 
 
-def _set_aside(path: Path, name: str, manifest: dict, problem: str, repair: bool) -> Finding:
+def _set_aside(path: Path, name: str, shards: dict, problem: str, repair: bool) -> Finding:
     if repair:
-        manifest["shards"].pop(name, None)
+        shards.pop(name, None)
         if (path / name).exists():
             (path / name).replace(path / f"{name}.corrupt")
         problem = f"{problem.split(';')[0]}; set aside, `foretrace simulate` makes it again"
     return Finding(name, problem, repair)
 
 
-def _unsound_numbers(name: str, table: pa.Table) -> Iterator[Finding]:
-    """NaN, infinities, wrong lengths and quaternions that are no rotations."""
-    scalars = [
-        f.name
-        for f in storage.SCHEMA
-        if pa.types.is_floating(f.type) and f.name not in storage.OPTIONAL_COLUMNS
-    ]
-    columns = [*storage.TRAJECTORIES, "joint_trajectory", "num_joints", "id", "outcome", *scalars]
-    columns += storage.ACTION_COLUMNS
-    for row in table.select(columns).to_pylist():
-        who = f"interaction {row['id']}"
-        num_samples = len(row["times"])
-        widths = {**storage.TRAJECTORIES, "joint_trajectory": row["num_joints"]}
-        if num_samples == 0 and row["outcome"] != FAILED:
-            yield Finding(name, f"{who} has no samples although its outcome is {row['outcome']}")
+def _unsound_rows(name: str, table: pa.Table) -> Iterator[Finding]:
+    ids = table["id"].to_pylist()
+    for row, problem in find_faults(table):
+        yield Finding(name, f"interaction {ids[row]}: {problem}")
+    for text in table["object"].unique().drop_null().to_pylist():
         try:
-            outcomes = storage.decode_action(row).outcomes
-        except ActionError as error:
-            yield Finding(name, f"{who}: {error}")
-        else:
-            if row["outcome"] not in (*outcomes, FAILED):
-                yield Finding(name, f"{who} has the unknown outcome {row['outcome']!r}")
-        for column, width in widths.items():
-            values = np.array(row[column], dtype=float)
-            if len(values) != num_samples * width:
-                yield Finding(name, f"{who}: {column} has {len(values)} numbers for {num_samples} samples")
-            elif not np.isfinite(values).all():
-                yield Finding(name, f"{who}: {column} holds NaN or infinity")
-            elif width == 7:
-                norms = np.linalg.norm(values.reshape(-1, 7)[:, 3:], axis=1)
-                worst = np.abs(norms - 1).max(initial=0)
-                if worst > QUATERNION_TOLERANCE:
-                    yield Finding(name, f"{who}: a quaternion of {column} has a norm {worst:.2g} away from 1")
-        if unknown := [scalar for scalar in scalars if row[scalar] is None or not np.isfinite(row[scalar])]:
-            yield Finding(name, f"{who}: {', '.join(unknown)} is not a number")
-        if np.any(np.diff(row["times"]) <= 0):
-            yield Finding(name, f"{who}: its times do not rise")
+            object_from_json(text)
+        except ShapeError as error:
+            row = table["object"].to_pylist().index(text)
+            yield Finding(name, f"interaction {ids[row]}: its object cannot be read: {error}")
 
 
 def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Finding]:
     """What is drawn anew for every interaction, outside of the range that the configuration gives."""
     ranges = manifest["configuration"].get("randomisation") or {}
     ranges = {column: drawn for column, drawn in ranges.items() if drawn is not None}
-    columns = {column: table[column].to_numpy() for column in ranges if column in table.column_names}
+    drawn_columns = [f.name for f in table.schema if pa.types.is_floating(f.type) and f.name in ranges]
+    columns = {column: table[column].to_numpy() for column in drawn_columns}
     try:
         columns |= storage.parameter_values(table)
         nominal = ToolPath(**manifest["configuration"].get("path", {})).parameters()["speed"]
     except (ActionError, TypeError):
-        return  # reported with the numbers
+        return
     for column in ranges.keys() & columns.keys():
         drawn, values = ranges[column], columns[column]
         low, high = (-drawn, drawn) if isinstance(drawn, int | float) else drawn
@@ -159,19 +150,34 @@ def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Findin
             yield Finding(name, f"{who}: {column} = {values[row]:g} was not drawn from {low:g} to {high:g}")
 
 
+def _without_gaps(ids: Iterable[int], start: int, stop: int) -> bool:
+    found = sorted(set(ids))
+    return len(found) == stop - start > 0 and found[0] == start and found[-1] == stop - 1
+
+
+def _unsound_notes(path: Path, tables: dict[str, pa.Table]) -> Iterator[Finding]:
+    """Notes beside recordings that are missing or damaged."""
+    for table in tables.values():
+        for id in table["id"].drop_null().to_pylist():
+            try:
+                recorded.read_notes(path, id)
+            except DatasetError as error:
+                yield Finding(f"{recorded.NOTES_FOLDER}/{id:05d}.json", str(error))
+
+
 def _unsound_ids(tables: dict[str, pa.Table], manifest: dict) -> Iterator[Finding]:
     """Duplicate ids, ids in the wrong shard, and shards that are still to come."""
     size, num_trials = manifest["shard_size"], manifest["num_trials"]
     starts = {storage.shard_name(k): start for k, start in enumerate(range(0, num_trials, size))}
     seen: set[int] = set()
     for name, table in tables.items():
-        ids = table["id"].to_pylist()
-        if twice := sorted({id for id in ids if id in seen or ids.count(id) > 1}):
-            yield Finding(name, f"duplicate ids {twice}")
-        seen.update(ids)
+        counts = Counter(table["id"].drop_null().to_pylist())
+        if twice := sorted(id for id, count in counts.items() if id in seen or count > 1):
+            yield Finding(name, f"duplicate ids {shown(twice)}")
+        seen.update(counts)
         if name not in starts:
             yield Finding(name, f"does not belong to a data set of {num_trials} interactions; remove it")
-        elif sorted(set(ids)) != list(range(starts[name], min(starts[name] + size, num_trials))):
+        elif not _without_gaps(counts, starts[name], min(starts[name] + size, num_trials)):
             yield Finding(name, f"its ids do not run from {starts[name]} on without gaps")
     for name in starts:
         if name not in tables:

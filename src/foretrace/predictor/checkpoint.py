@@ -28,6 +28,8 @@ DEFAULT = "default"
 """Folder of the predictor that comes with the package."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
+UNBOUNDED = "quantiles"
+"""Tensors in which infinity is the size of a region that holds everything; nowhere else is it a number."""
 
 
 class PredictorEntries(TypedDict):
@@ -188,7 +190,7 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -
     Raises:
         CheckpointError: A tensor is missing, unexpected, of another shape or type, or holds what is no number.
     """
-    expected, weights = module.state_dict(), dict(module.named_parameters())
+    expected = module.state_dict()
     advice = f"it does not belong to its {CONFIG}"
     if missing := sorted(expected.keys() - tensors.keys()):
         raise CheckpointError(f"{file} lacks the tensors {', '.join(missing)}: {advice}")
@@ -201,8 +203,7 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], file: Path) -
                 f"{file}: {name} is {tuple(tensor.shape)} {tensor.dtype}, its {CONFIG} asks for "
                 f"{tuple(wanted.shape)} {wanted.dtype}"
             )
-        # What is no weight may be infinite, such as the radius of a region that holds everything.
-        if (tensor if name not in weights else tensor - tensor).isnan().any():
+        if (tensor if name.endswith(UNBOUNDED) else tensor.float() * 0).isnan().any():
             raise CheckpointError(f"{file}: {name} holds NaN or infinity: copy it again or train anew")
     module.load_state_dict(dict(tensors))
 
