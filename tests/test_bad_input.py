@@ -13,7 +13,13 @@ import foretrace as ft
 from factories import fake_batch, fake_interaction
 from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError, TrainingError, ViewError
 from foretrace.interactions.dataset import RowError
-from foretrace.interactions.splits import Split
+from foretrace.interactions.splits import (
+    Split,
+    scaled_sizes,
+    split_by_corner_count,
+    split_by_object,
+    split_by_seed,
+)
 from foretrace.predictor import EffectPredictor, PredictorConfig
 from foretrace.simulation.collect import CollectConfig, collect
 
@@ -112,6 +118,15 @@ REFUSED = {
         "context is 3": lambda: ft.LstmConfig(context=3),
         "feature_options of type list": lambda: ft.LstmConfig(feature_options=[1]),
         "num_samples is 'x'": lambda: LSTM.make("x"),
+        "n of type InteractionBatch: give the number": lambda: split_by_seed(ft.InteractionBatch.from_views([VIEW]), 0),
+        "n is 30.5": lambda: split_by_seed(30.5, 0, None),
+        "seed is -1: give a whole number": lambda: split_by_seed(30, -1, None),
+        "sizes is 3: give the sizes of three parts": lambda: split_by_seed(30, 0, 3),
+        "sizes is (3, 4)": lambda: split_by_seed(30, 0, (3, 4)),
+        "a part's size is 3.5": lambda: split_by_seed(30, 0, (3.5, 4, 1)),
+        "shares of a split are (0.5, 0.5)": lambda: scaled_sizes(10, (0.5, 0.5)),
+        "object_ids of type int": lambda: split_by_object(3, 0),
+        "num_corners of type str": lambda: split_by_corner_count("3", (3,)),
         "PredictorConfig makes no predictor": lambda: PredictorConfig().make(9),
     },
     DatasetError: {
@@ -244,3 +259,11 @@ def test_an_effect_of_an_object_elsewhere_is_refused():
     moved = replace(effect, com_trajectory=effect.com_trajectory + np.array([0.3, 0.0, 0.0]))
     with pytest.raises(ft.ForetraceError, match="cm outside the object in the view"):
         ft.load_predictor().imagine(VIEW, observed=moved)
+
+
+def test_one_row_of_a_batch_is_a_batch():
+    batch = fake_batch(np.random.default_rng(0), 4)
+    assert [len(row) for row in batch] == [1, 1, 1, 1]
+    np.testing.assert_array_equal(batch[-1].com, batch.com[3:])
+    check(DatasetError, "[4] chooses no rows of 4", lambda: batch[4])
+    check(DatasetError, "slice('a', None, None) chooses no rows", lambda: batch["a":])

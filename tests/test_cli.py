@@ -342,7 +342,7 @@ def test_a_file_in_the_way_of_an_output_is_told_in_one_line(command, folder, tmp
     printed = capsys.readouterr().err
     assert printed.startswith("foretrace: error: ")
     assert printed.count("\n") == 1
-    assert f"cannot use {tmp_path / 'file'}" in printed
+    assert f"cannot be made: {tmp_path / 'file'} is a file" in printed
 
 
 def test_ctrl_c_while_a_compiled_module_is_loaded_is_no_error(monkeypatch, capsys):
@@ -395,3 +395,32 @@ def test_an_interrupted_run_keeps_what_is_done_and_says_how_to_go_on(tmp_path, s
     while group_lives(process.pid):
         assert time.monotonic() < deadline, "workers were left behind"
         time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["predict", "--out", "file"], "--out file is a file: name a folder"),
+        (["predict", "--out", "file/below"], "file is a file; choose another --out"),
+        (["train", "--data", "d", "--out", "/proc/below"], "--out /proc/below cannot be written (/proc: "),
+        (["export", "lerobot", "--data", "d", "--out", "file/below"], "file is a file; choose another"),
+        (["export", "onnx", "--out", "folder"], "--out folder is a folder: name a file"),
+        (["data", "folder"], "or make one with `foretrace simulate --out data/NAME`"),
+        (["data", "file"], "file is a file: give the folder of a data set"),
+    ],
+)
+def test_where_nothing_can_be_written_is_said_first(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    assert cli.main(words) == 2
+    assert message in capsys.readouterr().err
+    assert {each.name for each in tmp_path.iterdir()} == {"file", "folder"}
+
+
+def test_so_many_epochs_as_are_asked_for(tmp_path, folder, capsys):
+    train = ["train", "--data", str(folder), "--features", "none", "--hidden", "4", "--threads", "1"]
+    assert cli.main([*train, "--out", str(tmp_path / "run"), "--epochs", "2"]) == 0
+    assert "epoch 2/2" in capsys.readouterr().out
+    assert cli.main([*train, "--out", str(tmp_path / "none"), "--outcomes", "rolled"]) == 2
+    assert "no interaction has an outcome among rolled; the data has: levered" in capsys.readouterr().err

@@ -153,7 +153,7 @@ def test_depth_takes_over_where_no_marker_is_seen(recorded: Recorded, images: di
     [
         ({"mask": "background"}, "needs --background"),
         ({"mask": "depth"}, "needs --depth"),
-        ({}, "needs --box"),
+        ({}, "give --box LEFT TOP WIDTH HEIGHT round it, --background, --depth"),
     ],
 )
 def test_what_a_method_needs_is_named(recorded: Recorded, images: dict, settings: dict, message: str) -> None:

@@ -13,7 +13,9 @@ from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from io import StringIO
+from pathlib import Path
 from shutil import get_terminal_size
+from tempfile import TemporaryFile
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
@@ -154,7 +156,37 @@ def read_options(command: Callable[..., int | None], words: Sequence[str], progr
         if end.code == USAGE and told.getvalue():
             raise CommandError(_in_one_line(told.getvalue(), program)) from None
         raise
+    _check_out(ready, documentation.partition("\n    out: ")[2])
     return ready
+
+
+def _check_out(ready: Any, about: str) -> None:
+    """Refuse an --out that cannot be written before the work is done.
+
+    Args:
+        ready: The command with its options.
+        about: What its documentation says of --out, which begins with "Folder" for a folder; may be empty.
+
+    Raises:
+        CommandError: Naming what is in the way.
+    """
+    given = getattr(ready, "keywords", {})
+    places = [given.get("out"), *(getattr(value, "out", None) for value in given.values())]
+    for out in (place for place in places if isinstance(place, Path)):
+        if out.is_file() and about.startswith("Folder"):
+            raise CommandError(f"--out {out} is a file: name a folder")
+        if out.is_dir() and about and not about.startswith("Folder"):
+            raise CommandError(f"--out {out} is a folder: name a file")
+        there = next(place for place in (out, *out.absolute().parents) if place.exists())
+        if there != out and not there.is_dir():
+            raise CommandError(f"--out {out} cannot be made: {there} is a file; choose another --out")
+        try:
+            with TemporaryFile(dir=there) if there.is_dir() else open(there, "ab"):
+                pass
+        except OSError as reason:
+            raise CommandError(
+                f"--out {out} cannot be written ({there}: {reason.strerror}): choose another --out"
+            ) from None
 
 
 def _in_one_line(told: str, program: str) -> str:

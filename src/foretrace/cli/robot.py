@@ -131,19 +131,24 @@ def _agreed(host: str, num_set_points: int) -> bool:
 
 
 def _print_checks(checks: list[Check]) -> None:
-    """A table for each leg."""
+    """One line for each leg that passes all its checks, and a table of what is refused of the others."""
     for leg, members in groupby(checks, key=lambda check: check.leg):
-        table = Table(title=leg.capitalize(), title_justify="left", box=None, padding=(0, 1))
+        members = list(members)
+        refused = [check for check in members if not check.passed]
+        print(f"{leg}: {len(members) - len(refused)} of {len(members)} checks passed")
+        if not refused:
+            continue
+        table = Table(box=None, padding=(0, 1))
         for heading in ("check", "joint", "at [s]", "worst", "limit", ""):
             table.add_column(heading, justify="right" if heading in ("at [s]", "worst") else "left")
-        for check in members:
+        for check in refused:
             table.add_row(
                 check.name,
                 check.joint or "",
                 f"{check.time:.2f}",
                 f"{check.value:.4f}",
                 f"{'>=' if check.at_least else '<='} {check.limit:.4g} {check.unit}",
-                "ok" if check.passed else "[bold]REFUSED[/bold]",
+                "[bold]REFUSED[/bold]",
             )
         Console().print(table)
 

@@ -57,6 +57,8 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         given = {each.metadata["name"]: value for each, value in values if value != each.default}
         named = {word.partition("=")[0] for word in words if word.startswith("--")}
         if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
+            if "--epochs" in named and "--min-steps" not in named:
+                training = replace(training, min_steps=1)  # who asks for one epoch gets one
             _train(data, out, replace(config, feature_options=given), training, split, fresh)
         if card:
             write_text(out / CARD, model_card(out, data))
@@ -129,7 +131,9 @@ def _train(
     fresh: bool,
 ) -> None:
     outcomes = training.outcomes or getattr(config, "outcomes", None) or (str(Outcome.LEVERED),)
-    dataset = Dataset.open(data).where(outcome=outcomes)
+    everything = Dataset.open(data)
+    # Without any of them the training itself says which outcomes there are.
+    dataset = everything.where(outcome=outcomes) or everything
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
     with when_interrupted(f"the best model so far is in {out}, the same command goes on from there"):

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -59,10 +60,15 @@ class InteractionBatch:
     def __getitem__(self, rows: Any) -> "InteractionBatch":
         """The given rows (slice, index array or boolean array) as a batch; ``times`` stays common to all.
 
+        One row number gives a batch of one.
+
         Raises:
             RowError: There are no such rows.
         """
-        rows = rows if isinstance(rows, slice) else chosen_rows(len(self), rows)
+        if isinstance(rows, Integral) and not isinstance(rows, bool):
+            rows = [int(rows)]
+        chosen = chosen_rows(len(self), rows)
+        rows = rows if isinstance(rows, slice) else chosen
         kept = {
             f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("times", "parameters")
         }

@@ -1,12 +1,12 @@
 """Who is training, validation and test data: by seed (paper, section 5), by object, by corner count."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, is_number, is_whole
 
 PAPER_SIZES = (1400, 100, 300)
 """Training, validation and test interactions in the paper (section 5)."""
@@ -35,13 +35,19 @@ def split_by_seed(n: int, seed: int, sizes: tuple[int, int, int] | None = PAPER_
         sizes: Interactions in each part; None for the paper's proportions whatever ``n`` is.
 
     Raises:
-        TrainingError: The parts are larger than the data, or one of them would be empty.
+        TrainingError: The parts are larger than the data, one of them would be empty, or a number is none.
     """
+    _check_whole("n", n, "the number of interactions, as len(dataset)")
+    _check_whole("seed", seed, "a whole number from 0 on")
     sizes = scaled_sizes(n) if sizes is None else sizes
+    if not isinstance(sizes, Sequence) or len(sizes) != 3:
+        raise TrainingError(f"sizes is {sizes!r:.60}: give the sizes of three parts, or None")
+    for size in sizes:
+        _check_whole("a part's size", size, "a whole number")
     if sum(sizes) > n:
         raise TrainingError(
             f"a split of {sizes[0]} + {sizes[1]} + {sizes[2]} needs {sum(sizes)} interactions, the data has "
-            f"{n}: simulate more objects, or use the paper's proportions of what there is (split=None, or no --split)"
+            f"{n}: simulate more objects, or use the paper's proportions of what there is (None, or no --split)"
         )
     _require_filled(*sizes)
     train, validation, test, _ = np.split(np.random.default_rng(seed).permutation(n), np.cumsum(sizes))
@@ -54,6 +60,9 @@ def scaled_sizes(n: int, fractions: tuple[float, float, float] = PAPER_FRACTIONS
     Raises:
         TrainingError: Fewer than three interactions, or shares that do not sum to 1.
     """
+    _check_whole("n", n, "the number of rows")
+    if not isinstance(fractions, Sequence) or len(fractions) != 3 or not all(map(is_number, fractions)):
+        raise TrainingError(f"the shares of a split are {fractions!r:.60}: give three numbers that sum to 1")
     if min(fractions) <= 0 or not np.isclose(sum(fractions), 1):
         raise TrainingError(f"the shares of a split must be positive and sum to 1, not {fractions}")
     if n < 3:
@@ -76,8 +85,10 @@ def split_by_object(
         fractions: Share of the objects in each part.
 
     Raises:
-        TrainingError: Fewer than three objects, or shares that do not sum to 1.
+        TrainingError: Fewer than three objects, shares that do not sum to 1, or no numbers of objects.
     """
+    _check_rows("object_ids", object_ids)
+    _check_whole("seed", seed, "a whole number from 0 on")
     objects = np.random.default_rng(seed).permutation(np.unique(object_ids))
     if len(objects) < 3:
         raise TrainingError(f"{len(objects)} objects cannot be split in three: simulate more objects")
@@ -102,6 +113,8 @@ def split_by_corner_count(
     Raises:
         TrainingError: A corner count does not occur, or nothing is left to learn from.
     """
+    _check_rows("num_corners", num_corners)
+    _check_whole("seed", seed, "a whole number from 0 on")
     present = np.unique(num_corners).tolist()
     if absent := sorted(set(held_out) - set(present)):
         raise TrainingError(f"no object has {absent} corners to hold out; the data has {present}")
@@ -110,6 +123,22 @@ def split_by_corner_count(
     count = max(1, round(validation_share * len(others)))
     _require_filled(len(others) - count, count, int(is_test.sum()))
     return _ordered(others[count:], others[:count], np.flatnonzero(is_test))
+
+
+def _check_whole(name: str, value: object, wanted: str) -> None:
+    if not is_whole(value, 0, 2**63 - 1):
+        given = f"{value}" if is_number(value) else f"of type {type(value).__name__}"
+        raise TrainingError(f"{name} {'is ' if is_number(value) else ''}{given}: give {wanted}")
+
+
+def _check_rows(name: str, values: object) -> None:
+    array = (
+        values if isinstance(values, np.ndarray) else np.asarray(values if isinstance(values, list) else 0)
+    )
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        raise TrainingError(
+            f"{name} of type {type(values).__name__}: give an array of whole numbers, as batch.{name}"
+        )
 
 
 def _require_filled(*sizes: int) -> None:

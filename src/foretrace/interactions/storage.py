@@ -351,11 +351,16 @@ def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
         DatasetError: No data set is there, its manifest is damaged, or it is of another format version.
     """
     path = folder / MANIFEST
-    remedy = f"make one with `foretrace simulate --out {folder}`"
-    if not folder.is_dir():
+    free = not folder.exists()
+    remedy = f"make one with `foretrace simulate --out {folder if free else 'data/NAME'}`"
+    if not folder.is_dir() and not free:
+        raise DatasetError(f"{folder} is a file: give the folder of a data set, or {remedy}")
+    if free:
         raise DatasetError(f"no data set at {folder}: no such folder; {remedy}")
     if not path.is_file():
-        raise DatasetError(f"{folder} is not a data set: it has no {MANIFEST}; {remedy}")
+        raise DatasetError(
+            f"{folder} is not a data set: it has no {MANIFEST}; give the folder of one, or {remedy}"
+        )
     remedy = "simulate again into a new folder"
     manifest = read_versioned(path, Manifest, FORMAT, FORMAT_VERSION, DatasetError, remedy, older=(1,))
     if manifest["format_version"] not in (FORMAT_VERSION, *older):

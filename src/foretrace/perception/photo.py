@@ -180,6 +180,11 @@ def _find(
     method: MaskMethod = "grabcut" if config.box is not None or heights is None else "depth"
     if config.box is None and background is not None:
         method = "background"
+    if config.mask is None and method == "grabcut" and config.box is None:
+        raise PerceptionError(
+            "nothing tells the object from the table: give --box LEFT TOP WIDTH HEIGHT round it, --background, "
+            "--depth, or --mask colour or threshold"
+        )
     method = config.mask or method
     if method == "background":
         if background is None:
