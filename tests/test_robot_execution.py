@@ -169,9 +169,10 @@ def test_a_camera_that_ends_early_is_told(video, tmp_path):
     assert len((tmp_path / "film" / "timestamps.csv").read_text().splitlines()) == 2
 
 
-def test_a_camera_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(RobotError, match=r"camera \S+none\.avi gives no image"):
-        VideoRecorder(str(tmp_path / "none.avi"), tmp_path / "film")
+@pytest.mark.parametrize("source", ["none.avi", "", "9" * 30, "/dev/null"])
+def test_a_camera_that_is_not_there_is_named(tmp_path, source):
+    with pytest.raises(RobotError, match=f"camera '{source}' gives no image"):
+        VideoRecorder(source, tmp_path / "film")
 
 
 @pytest.mark.parametrize(

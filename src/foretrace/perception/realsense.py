@@ -31,7 +31,7 @@ class CaptureConfig:
     """How a camera records.
 
     Raises:
-        PerceptionError: A value is not positive.
+        PerceptionError: A value is out of its range.
     """
 
     width: int = 1280
@@ -46,9 +46,8 @@ class CaptureConfig:
     """Serial number of the camera; None: the only one."""
 
     def __post_init__(self) -> None:
-        limits = dict.fromkeys(("width", "height", "frames_per_second"), (1, np.inf)) | {
-            "depth_every": (0, np.inf)
-        }
+        limits = dict.fromkeys(("width", "height"), (1, 10_000))
+        limits |= {"frames_per_second": (1, 1000), "depth_every": (0, 10_000)}
         check_ranges(PerceptionError, "capture", self, limits, "give a whole number")
 
 

@@ -1,5 +1,6 @@
 """Record a motion while it happens, into the folder format that `interactions.recording_folder` defines."""
 
+import re
 import threading
 import time
 import warnings
@@ -29,11 +30,13 @@ class VideoRecorder:
     def __init__(self, source: str, folder: Path) -> None:
         if folder.exists() and any(folder.iterdir()):
             raise RobotError(f"{folder} is in use: choose another folder")
-        self._capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+        number = int(source) if re.fullmatch(r"[0-9]{1,3}", source) else None
+        self._capture = cv2.VideoCapture()
+        opened = bool(source) and self._capture.open(source if number is None else number)
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the sensor's pixels, as everywhere
-        if not self._capture.grab():
+        if not opened or not self._capture.grab():
             raise RobotError(
-                f"camera {source} gives no image: choose a number, a device or a file that OpenCV opens"
+                f"camera {source[:80]!r} gives no image: choose a number, a device or a file that OpenCV opens"
             )
         self._folder, self._first, self._finish = folder, threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._record, daemon=True)
