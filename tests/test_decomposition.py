@@ -1,5 +1,11 @@
 """Convex pieces of meshes: they have the mesh's volume, do not overlap, are few, and are kept."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 import shapely
@@ -105,7 +111,9 @@ def test_pieces_are_the_same_each_time():
 def test_a_volume_that_pieces_miss_is_refused(monkeypatch):
     monkeypatch.setattr(decomposition, "MOST_PIECES", 4)
     vertices, faces = surface_of(shape("cup")[0])
-    with pytest.raises(ShapeError, match=r"4 convex pieces miss the volume by \+\d.* %: thin curved walls"):
+    with pytest.raises(
+        ShapeError, match=r"4 convex pieces of the mesh miss its volume by \+\d.* %: thin curved walls"
+    ):
         MeshObject(vertices * 1.01, faces).convex_pieces()
 
 
@@ -156,3 +164,22 @@ def test_a_picture_cuts_nothing(monkeypatch):
     )
     assert obj.support_corners.shape == obj.corners.shape
     assert not obj.is_round
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_cutting_hears_ctrl_c_and_kill(number):
+    code = (
+        "from manifold3d import Manifold; from foretrace.objects.decomposition import decompose\n"
+        "bowl = Manifold.sphere(0.06, 160).trim_by_plane((0, 0, -1), 0) - Manifold.sphere(0.055, 160)\n"
+        "print('cutting', flush=True)\n"
+        "while True: decompose(bowl)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(0.5)
+    process.send_signal(number)
+    assert process.wait(timeout=20) != 0

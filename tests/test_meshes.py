@@ -6,16 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from foretrace.actions import LeverUp
 from foretrace.errors import ShapeError
 from foretrace.geometry import polygon_area
 from foretrace.objects import (
     NO_BEVEL,
     Bevel,
+    Box,
     MeshObject,
     Prism,
     sample_prism,
 )
 from foretrace.objects.model import fitting_bevel
+from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
 L_SHAPE = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.06], [0.06, 0.06], [0.06, 0.2], [0.0, 0.2]])
 
@@ -161,3 +164,24 @@ def test_inside_out_mesh_is_turned():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     obj = MeshObject(np.array(box.vertices), np.array(box.faces)[:, ::-1])
     assert obj.mass_properties(1000.0).mass == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [0.001, 0.01, 1.0])
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+def test_a_box_is_levered_as_mesh_prism_and_box(tmp_path, unit, turn):
+    size = (0.12, 0.08, 0.02)
+    mesh = trimesh.creation.box(np.array(size) / unit)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
+    mesh.export(tmp_path / "box.stl")
+    obj = MeshObject.load(tmp_path / "box.stl", scale=unit)
+    prism = Prism(obj.corners, obj.height, obj.bevel)
+    box = Box(*size)
+    short = [int(np.argmin(np.linalg.norm(np.diff(o.corners, axis=0), axis=1))) for o in (obj, prism, box)]
+    effects = [
+        simulate_lever_up(o, LeverUp.at_edge(o, edge), SimulationConfig(embodiment="tool")).effect
+        for o, edge in zip((obj, prism, box), short, strict=True)
+    ]
+    assert len({str(effect.outcome) for effect in effects}) == 1
+    heights = [effect.com_trajectory[:, 2].max() for effect in effects]
+    np.testing.assert_allclose(heights, heights[0], atol=5e-4)
