@@ -1,8 +1,11 @@
 """Markers as they are published, printed and read."""
 
+import importlib
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -13,7 +16,8 @@ from foretrace.errors import PerceptionError
 from foretrace.geometry import rotation_angle
 from foretrace.interactions import marker_patterns
 from foretrace.interactions.marker_patterns import PUBLISHED, draw_marker
-from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
+from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.markers import Detections, MarkerBody, MarkerLayout, align_patterns, detect_markers
 from foretrace.perception.tracking import still_pose
 from printed_scene import CAMERA, image_of, looking_at
 
@@ -143,6 +147,69 @@ def test_tags_that_opencv_printed_are_named_and_have_a_layout(tmp_path: Path) ->
         still_pose([seen], layout_of(tmp_path / "markers.json", range(3), SPOTS).table, CAMERA)
     turned = layout_of(tmp_path / "markers.json", range(3), SPOTS, angle_deg=180)
     assert rotation_angle(still_pose([seen], turned.table, CAMERA)[:3, :3], T[:3, :3]) < np.deg2rad(1.0)
+
+
+def small(size: float, tilt: float, seed: int, id: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """An image of a marker of 5 cm whose side measures so many pixels where it is not slanted, and T_camera_marker."""
+    rng = np.random.default_rng(seed)
+    axis = rng.uniform(0, 2 * np.pi)
+    turn, _ = cv2.Rodrigues(np.deg2rad(tilt) * np.array([np.cos(axis), np.sin(axis), 0.0]))
+    T = np.eye(4)
+    T[:3, :3] = turn @ np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = PLAIN.fx * 0.05 / size * PLAIN.rays(rng.uniform(120, 360, (1, 2)))[0]
+    marker = np.pad(draw_marker("apriltag_36h11", id), 1, constant_values=255)
+    return prints().photograph(marker, (0.0625, 0.0625), T, PLAIN, rng), T
+
+
+PLAIN = PinholeCamera(480, 480, 600.0, 600.0, 240.0, 240.0)
+
+
+def prints() -> ModuleType:
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    try:
+        return importlib.import_module("prints")
+    finally:
+        del sys.path[0]
+
+
+@pytest.mark.parametrize("tilt", [15.0, 35.0, 55.0])
+def test_small_tags_tell_distance_and_direction(tilt: float) -> None:
+    """Goals: 0.2 % of the distance and 0.3 degrees from tags of 30 pixels."""
+    distance, turn = [], []
+    for seed in range(6):
+        image, T = small(30, tilt, seed)
+        seen = align_patterns(image, detect_markers(image, "apriltag_36h11"), "apriltag_36h11")
+        found = still_pose([seen], MarkerBody.single(3, 0.05), PLAIN)
+        distance.append(np.linalg.norm(found[:3, 3]) / np.linalg.norm(T[:3, 3]) - 1)
+        turn.append(np.rad2deg(rotation_angle(found[:3, :3], T[:3, :3])))
+    assert abs(np.mean(distance)) < 0.0015
+    assert np.median(np.abs(distance)) < 0.002
+    assert np.median(turn) < 0.3
+    assert np.max(turn) < 5.0
+
+
+def corners_seen(tilt: float, noise: float, seed: int, distance: float = 1.0) -> Detections:
+    rng, T = np.random.default_rng(seed), looking_at(np.deg2rad(tilt), 0.0, distance, 0.0)
+    body = MarkerBody.single(3, 0.05)
+    return Detections(np.array([3]), (PLAIN.project(body.corners(3), T) + rng.normal(0, noise, (4, 2)))[None])
+
+
+def test_a_tag_that_two_poses_explain_alike_is_refused() -> None:
+    body = MarkerBody.single(3, 0.05)
+    for seed in range(5):
+        with pytest.raises(
+            PerceptionError, match=r"seen alike from two directions \d+ degrees apart: go nearer"
+        ):
+            still_pose([corners_seen(20.0, 0.5, seed)], body, PLAIN)
+    still_pose([corners_seen(40.0, 0.01, 0)], body, PLAIN)
+
+
+def test_a_tag_that_is_seen_too_flat_is_refused_as_that() -> None:
+    body = MarkerBody.single(3, 0.05)
+    with pytest.raises(
+        PerceptionError, match=r"seen at 1[0-4] degrees above their plane, 15 are needed: .* higher up"
+    ):
+        still_pose([corners_seen(80.0, 0.01, 0, 0.3)], body, PLAIN)
 
 
 def test_printed_markers_have_their_size_and_stand_upright(

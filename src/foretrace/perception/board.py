@@ -145,7 +145,9 @@ class Board:
     def what_is_missing(self, image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
         """Why an image does not show enough of the board, in words."""
         found = f"shows {len(self.find(image)[0])} corners of the board"
-        if fault := recognise([image], self)[1] or image_fault(image, self.dictionary) or _chessboard(image):
+        plain, legible = _chessboard(image)
+        fault = recognise([image], self)[1] or image_fault(image) or plain * (not legible)
+        if fault := fault or image_fault(image, self.dictionary) or plain:
             return f"{found}: {fault}"
         return f"{found}, {FEWEST_CORNERS} over two rows are needed: show more of it, and check squares and dictionary"
 
@@ -248,20 +250,20 @@ def _misfit(seen: Detections, columns: int, first: int, in_corner: bool) -> floa
     return float(np.linalg.norm(fitted - squares, axis=1).max())
 
 
-def _chessboard(image: UInt8[np.ndarray, "rows columns *channels"]) -> str:
-    """What an image of a plain chessboard is, in words; empty if it is none."""
+def _chessboard(image: UInt8[np.ndarray, "rows columns *channels"]) -> tuple[str, bool]:
+    """What an image of a chessboard shows, in words (empty if it is none), and whether markers would be legible."""
     values = grey(image)
     scale = min(1.0, CHESSBOARD_PIXELS / values.shape[1])
     small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, inner = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
     if not found:
-        return ""
+        return "", True
     rows, columns = np.sort(inner.shape) + 1
     steps = np.linalg.norm(np.diff(corners.reshape(*inner.shape, 2), axis=1), axis=2)
     if (side := float(np.median(steps)) / scale) < LEGIBLE_SQUARE:
-        return f"its squares are {side:.0f} pixels wide, too small for markers to be read: go nearer"
+        return f"its squares are {side:.0f} pixels wide, too small for markers to be read: go nearer", False
     return (
         f"it shows a plain chessboard of {columns} x {rows} squares, without markers: print the board that "
         "`foretrace calibrate --print-board board.pdf` writes"
-    )
+    ), True

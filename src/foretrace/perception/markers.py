@@ -21,6 +21,7 @@ from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, planar_transform, rigid_transform, transform_points
 from foretrace.interactions.marker_patterns import DICTIONARIES, dictionary
 from foretrace.interactions.pinhole import PinholeCamera
+from foretrace.perception.alignment import fit_pattern
 from foretrace.schema import Count, Finite
 
 FORMAT = "foretrace-markers"
@@ -34,18 +35,8 @@ SMALLEST_SIDE = 10.0
 LEAST_SLANT = np.deg2rad(15.0)
 """Least angle between marker and line of sight: below, its two poses look alike and its pattern blurs [rad]."""
 
-CELL = 16
-"""Pixels along a module of the pattern that is drawn."""
-OVERSAMPLING = 4
-"""Pixels of the drawing along a pixel of the image, which are averaged."""
-BLUR = 0.8
-"""Standard deviation of what lens and sensor blur [pixel]."""
-BORDER = 6
-"""Pixels round a marker that take part."""
 LARGEST_ALIGNMENT = 6.0
 """Largest shift of a corner by an alignment that has not gone astray [pixel]."""
-LEAST_CORRELATION = 0.7
-"""An image that resembles the pattern less shows the marker covered or smeared."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +83,7 @@ def align_patterns(
 ) -> Detections:
     """Corners found anew from all of each marker's pattern, not from its outer rim alone; slower.
 
-    The known pattern, blurred as far as a pixel blurs, is aligned with the image (Evangelidis and Psarakis, 2008); a
-    marker that cannot be aligned is covered or smeared, and left out.
+    A marker whose pattern does not explain the image is covered or smeared, and left out.
 
     Args:
         image: The image.
@@ -101,58 +91,16 @@ def align_patterns(
         name: The markers' dictionary.
         only: Markers to treat; others are left out. By default all.
     """
-    values, found = grey(image), dictionary(name)
+    values = grey(image)
     kept, aligned = [], []
     for id, corners in zip(detections.ids, detections.corners, strict=True):
         if only is not None and id not in only:
             continue
-        # Once more from where the first alignment led: what is drawn then has the right slant.
-        moved = _align(values, found, int(id), corners)
-        moved = None if moved is None else _align(values, found, int(id), moved)
+        moved = fit_pattern(values, name, int(id), corners)
         if moved is not None and np.linalg.norm(moved - corners, axis=1).max() < LARGEST_ALIGNMENT:
             kept.append(int(id))
             aligned.append(moved)
     return Detections(np.array(kept, dtype=int), np.array(aligned).reshape(-1, 4, 2))
-
-
-def _align(
-    values: UInt8[np.ndarray, "rows columns"],
-    found: cv2.aruco.Dictionary,
-    id: int,
-    corners: Float[np.ndarray, "4 2"],
-) -> Float[np.ndarray, "4 2"] | None:
-    """A marker's corners after aligning the image with the pattern drawn as a camera would see it there."""
-    modules = found.markerSize + 2  # the code and its black rim
-    marker = cv2.aruco.generateImageMarker(found, id, CELL * modules, borderBits=1)
-    pattern = np.pad(marker, CELL, constant_values=255)
-    frame = CELL * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * modules / 2
-    middle = CELL * (modules + 2) / 2 - 0.5
-    low = np.floor(corners.min(axis=0)).astype(int) - BORDER
-    high = np.ceil(corners.max(axis=0)).astype(int) + BORDER + 1
-    if (low < 0).any() or (high > [values.shape[1], values.shape[0]]).any():
-        return None
-    patch = values[low[1] : high[1], low[0] : high[0]]
-    fine = (OVERSAMPLING * (corners - low + 0.5) - 0.5).astype(np.float32)
-    to_fine = cv2.getPerspectiveTransform((frame + middle).astype(np.float32), fine)
-    size = (OVERSAMPLING * patch.shape[1], OVERSAMPLING * patch.shape[0])
-    drawn = cv2.warpPerspective(pattern, to_fine, size, flags=cv2.INTER_AREA, borderValue=255)
-    drawn = cv2.resize(drawn, patch.shape[::-1], interpolation=cv2.INTER_AREA)
-    drawn = cv2.GaussianBlur(drawn, (0, 0), BLUR)
-    # Up to half a module of the margin counts: further out, what lies round the marker shines in.
-    rim = cv2.perspectiveTransform((frame * (1 + 1 / modules) + middle)[None].astype(np.float32), to_fine)[0]
-    inside = np.zeros(patch.shape, dtype=np.uint8)
-    cv2.fillConvexPoly(inside, np.rint((rim + 0.5) / OVERSAMPLING - 0.5).astype(np.int32), 255)
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
-    try:
-        likeness, to_drawn = cv2.findTransformECC(
-            patch, drawn, np.eye(3, dtype=np.float32), cv2.MOTION_HOMOGRAPHY, stop, inside, 3
-        )
-    except cv2.error:  # it did not converge
-        return None
-    if likeness < LEAST_CORRELATION:
-        return None
-    back = np.linalg.inv(to_drawn.astype(float))
-    return cv2.perspectiveTransform((corners - low)[None], back)[0].astype(float) + low
 
 
 def grey(image: Shaped[np.ndarray, "rows columns *channels"]) -> UInt8[np.ndarray, "rows columns"]:
@@ -211,6 +159,8 @@ class PoseCandidate:
     """The body in the camera frame."""
     error: float
     """Root mean square of the reprojection error [pixel]."""
+    slant: float = np.pi / 2
+    """Angle between the line of sight and the plane of the largest marker [rad]."""
 
 
 @dataclass(frozen=True)
@@ -249,8 +199,12 @@ class MarkerBody:
             return np.zeros((0, 3)), np.zeros((0, 2))
         return np.concatenate([self.corners(id) for id, _ in seen]), np.concatenate([c for _, c in seen])
 
-    def poses(self, detections: Detections, camera: PinholeCamera) -> list[PoseCandidate]:
+    def poses(
+        self, detections: Detections, camera: PinholeCamera, least_slant: float = LEAST_SLANT
+    ) -> list[PoseCandidate]:
         """Poses that explain the seen markers, the best first: none, one or two.
+
+        A marker that is seen too flat (`LEAST_SLANT`) counts as not seen.
 
         The two solutions of the largest marker (Collins and Bartoli, 2014), each refined on all corners that are seen.
         """
@@ -277,8 +231,8 @@ class MarkerBody:
             error = np.linalg.norm(camera.project(points, T) - pixels, axis=1)
             seen_from = invert_transform(T @ self.placements[largest])[:3, 3]
             slant = np.arcsin(seen_from[2] / np.linalg.norm(seen_from))
-            if np.isfinite(error).all() and slant > LEAST_SLANT:
-                found.append(PoseCandidate(T, float(np.sqrt((error**2).mean()))))
+            if np.isfinite(error).all() and slant > least_slant:
+                found.append(PoseCandidate(T, float(np.sqrt((error**2).mean())), float(slant)))
         return sorted(found, key=lambda candidate: candidate.error)
 
 

@@ -19,7 +19,7 @@ from foretrace.interactions.recording_folder import CAMERA, MARKERS, read_depth,
 from foretrace.objects import BEVEL
 from foretrace.objects.prism import DEFAULT_HEIGHT
 from foretrace.perception import masks
-from foretrace.perception.markers import MarkerLayout, align_patterns, detect_markers
+from foretrace.perception.markers import LEAST_SLANT, MarkerLayout, align_patterns, detect_markers
 from foretrace.perception.overlay import PREDICTED, draw_overlay
 from foretrace.perception.tracking import still_pose
 from foretrace.perception.views import Observation, contact_at_pixel, observe, place_object, view_of_depth
@@ -130,6 +130,7 @@ def observe_photo(
     if T_table_camera is None:
         T_table_camera = locate_camera(image, camera, layout, depth)
     heights = None if depth is None else masks.heights_above_table(depth, camera, T_table_camera)
+    _check_sight(camera, T_table_camera, contact)
     mask, rim = _find(image, contact, background, heights, config)
     height = config.height
     if height is None:
@@ -141,6 +142,19 @@ def observe_photo(
         T_action_camera = invert_transform(found.T_table_action) @ T_table_camera
         view = view_of_depth(depth, mask > 0.5, camera, T_action_camera)
     return PhotoView(found.placed, found.action, view, image, camera, T_table_camera, config.flat)
+
+
+def _check_sight(
+    camera: PinholeCamera, T_table_camera: Float[np.ndarray, "4 4"], contact: tuple[float, float]
+) -> None:
+    """Refuse a photograph that is taken too flat: errors of height and outline then grow along the line of sight."""
+    ray = T_table_camera[:3, :3] @ camera.rays(np.array([contact], dtype=float))[0]
+    above = np.arcsin(-ray[2] / np.linalg.norm(ray))
+    if above < LEAST_SLANT:
+        raise PerceptionError(
+            f"the photograph is taken from {np.rad2deg(above):.0f} degrees above the table, "
+            f"{np.rad2deg(LEAST_SLANT):.0f} are needed: take it from higher up"
+        )
 
 
 def locate_camera(

@@ -19,13 +19,19 @@ from scipy.spatial.transform import Rotation
 from foretrace.errors import PerceptionError
 from foretrace.geometry import rotation_angle
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.perception.markers import Detections, MarkerBody, PoseCandidate
+from foretrace.perception.markers import LEAST_SLANT, Detections, MarkerBody, PoseCandidate
 from foretrace.trajectories import interpolate_poses
 
 Matches = tuple[np.ndarray, np.ndarray]
 """Points of the body and where they were seen."""
 NOTHING: Matches = (np.zeros((0, 3)), np.zeros((0, 2)))
 ITERATIONS = 12
+CLEARER = 2.0
+"""How many times a second pose must err more than the best one for that to be the right one."""
+CORNER_NOISE = 0.02
+"""Least error of a pose that is compared [pixel]."""
+LEAST_APART = np.deg2rad(8.0)
+"""Two poses that differ by less are as good as one [rad]."""
 HUBER = 1.5
 """Largest residual that counts in full [standard deviations]."""
 
@@ -314,7 +320,7 @@ def still_pose(
         for id in often
     ]
     middle = Detections(np.array(often, dtype=int), np.array(places).reshape(-1, 4, 2))
-    poses = body.poses(middle, camera)
+    poses = body.poses(middle, camera, least_slant=0.0)
     if not poses or poses[0].error > config.largest_error:
         state = f"explained to {poses[0].error:.1f} pixels only" if poses else "not seen"
         remedy = "check their layout, sides, dictionary and light"
@@ -326,7 +332,25 @@ def still_pose(
                 'add "angle_deg": 180 to each in the layout'
             )
         raise PerceptionError(f"markers {body.ids} on the table are {state}: {remedy}")
+    _check_sight(poses, often)
     return poses[0].T_camera_body
+
+
+def _check_sight(poses: Sequence[PoseCandidate], ids: Sequence[int]) -> None:
+    """Refuse a still body that is seen too flat, or whose other pose explains the image as well."""
+    if poses[0].slant < LEAST_SLANT:
+        raise PerceptionError(
+            f"markers {list(ids)} are seen at {np.rad2deg(poses[0].slant):.0f} degrees above their plane, "
+            f"{np.rad2deg(LEAST_SLANT):.0f} are needed: take the image from higher up"
+        )
+    if len(poses) < 2:
+        return
+    apart = rotation_angle(poses[0].T_camera_body[:3, :3], poses[1].T_camera_body[:3, :3])
+    if apart > LEAST_APART and poses[1].error < CLEARER * max(poses[0].error, CORNER_NOISE):
+        raise PerceptionError(
+            f"markers {list(ids)} are seen alike from two directions {np.rad2deg(apart):.0f} degrees apart: go nearer, "
+            "or lay out more markers"
+        )
 
 
 def _runs(flags: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
