@@ -103,7 +103,7 @@ def test_the_command_prints_and_stores_deviations_whatever_the_orientation_tags(
         assert set(stored) == {"fx", "fy", "cx", "cy", "border"}
         assert f"± {stored['fx']:.1f} and" in printed
         cameras.append(PinholeCamera.load(out))
-    assert cameras[0] == cameras[1]
+    np.testing.assert_allclose(cameras[1].matrix, cameras[0].matrix, rtol=1e-6)
 
 
 def look(board: Board) -> np.ndarray:
