@@ -55,8 +55,8 @@ def test_camera_files(tmp_path: Path) -> None:
     assert PinholeCamera.load(tmp_path / "camera.json") == CAMERA
     good = CAMERA.to_dict()
     for change, message in (
-        ({"fx": None}, "no number"),
-        ({"fx": -3}, "fx = -3.0, it must be positive"),
+        ({"fx": None}, "entry fx is null"),
+        ({"fx": -3}, "entry fx is -3, a finite number above 0.0"),
         ({"cx": 900}, "cx = 900.0 lies outside"),
         ({"distortion": [1, 2]}, "0, 4, 5, 8, 12 or 14"),
         ({"version": 2}, "a fisheye lens has 4 finite"),
@@ -68,7 +68,7 @@ def test_camera_files(tmp_path: Path) -> None:
             PinholeCamera.load(tmp_path / "bad.json")
     del good["cy"]
     (tmp_path / "bad.json").write_text(json.dumps(good))
-    with pytest.raises(PerceptionError, match="lacks 'cy'"):
+    with pytest.raises(PerceptionError, match="entry cy is missing"):
         PinholeCamera.load(tmp_path / "bad.json")
     with pytest.raises(PerceptionError, match="foretrace calibrate"):
         PinholeCamera.load(tmp_path / "none.json")
@@ -205,7 +205,7 @@ def test_marker_layouts(tmp_path: Path) -> None:
     for change, message in (
         ({"object": [{"id": 3, "side": 0.03}]}, "each must be there once"),
         ({"object": [{"id": 60, "side": 0.03}]}, "from 0 to 49"),
-        ({"object": [{"id": 4, "side": 40}]}, "between 0.001 and 1 m"),
+        ({"object": [{"id": 4, "side": 40}]}, "side is 40, a finite number up to 1.0"),
         ({"object": [{"id": 4}]}, "side"),
         ({"version": 3}, "has format version 3"),
     ):

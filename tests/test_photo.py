@@ -245,3 +245,15 @@ def test_files_and_arrays_give_the_same(recorded: Recorded, images: dict) -> Non
     same = observe_photo(images.pop("image"), CAMERA, contact_pixel(truth), **images)
     np.testing.assert_array_equal(found.view.mask, same.view.mask)
     np.testing.assert_array_equal(found.T_table_camera, same.T_table_camera)
+
+
+def test_a_photograph_taken_too_flat_is_refused_as_that(recorded: Recorded, images: dict) -> None:
+    flat = np.eye(4)
+    flat[:3, 1], flat[:3, 2] = [0, 0, -1], [0, 1, 0]  # looks along the table
+    flat[:3, :3] = cv2.Rodrigues(np.array([np.deg2rad(-10.0), 0, 0]))[0] @ flat[:3, :3]
+    flat[:3, 3] = [0.0, -0.6, 0.1]
+    middle = (CAMERA.cx, CAMERA.cy)
+    with pytest.raises(
+        PerceptionError, match="from 10 degrees above the table, 15 are needed: take it from higher"
+    ):
+        observe_photo(images["image"], CAMERA, middle, T_table_camera=flat, background=images["background"])

@@ -27,7 +27,7 @@ CLEAR_FIT = 0.1
 """Largest misfit of markers on the squares of the right board; on a wrong one they are off by half [square]."""
 FEWEST_MARKERS = 6
 """Least number of markers by which a board is recognised."""
-LEGIBLE_SQUARE = 30.0
+LEGIBLE_SQUARE = 18.0
 """Least side of a square whose marker would be seen if there were one [pixel]."""
 CHESSBOARD_PIXELS = 800
 """Width to which an image is reduced to look for a plain chessboard."""
