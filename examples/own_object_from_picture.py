@@ -2,7 +2,8 @@
 
     python examples/own_object_from_picture.py [OUT.png]
 
-The silhouette is drawn here; your own would come from ``cv2.imread(file, cv2.IMREAD_GRAYSCALE)``.
+The silhouette is drawn here; your own comes from
+``foretrace.objects.shape_files.read_silhouette_image(file)``.
 """
 
 import sys

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from foretrace.errors import ShapeError
+from foretrace.cli.prediction import ObjectOptions
+from foretrace.errors import ForetraceError, ShapeError
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Prism, read_silhouette
 from foretrace.objects.shape_files import read_silhouette_image
@@ -154,6 +155,35 @@ def test_labels_that_do_not_fit_are_refused(
         read_silhouette_image(tmp_path / "mask", label)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"label": "one"}, "--label is one: give a number, or red, green and blue as 128,0,0"),
+        ({"label": "1,2"}, "give a number, or red, green and blue"),
+        (
+            {"image": None, "polygon": Path("outline.txt"), "invert": True},
+            "--label and --invert go with --image",
+        ),
+        ({"scale": None}, "--image needs --scale"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options: dict, message: str, tmp_path: Path) -> None:
+    Image.fromarray(WHOLE).save(tmp_path / "mask.png")
+    with pytest.raises(ForetraceError, match=message):
+        ObjectOptions(**{"image": tmp_path / "mask.png", "scale": 0.001, **options}).load()
+
+
+@pytest.mark.parametrize(
+    ("scale", "size", "likelier"), [(0.004, "50.9", "0.0004"), (0.00012, "1.53", "0.0012")]
+)
+def test_an_unusual_size_is_pointed_out(scale: float, size: str, likelier: str, tmp_path: Path) -> None:
+    Image.fromarray(np.pad(np.ones((90, 90), np.uint8), 9)).save(tmp_path / "mask.png")
+    with pytest.warns(
+        UserWarning, match=f"{size} cm long, check --scale: {likelier} m per pixel in place of"
+    ):
+        ObjectOptions(image=tmp_path / "mask.png", scale=scale).load()
+
+
 PAGE = 255 - 255 * WHOLE
 Y, X = np.mgrid[:150, :180]
 DISC = np.hypot(X - 90, Y - 75) < 60
@@ -235,6 +265,9 @@ def test_a_scale_that_makes_no_believable_object_is_named_with_a_likelier_one() 
         Prism.from_mask(square, 0.1)
 
 
-def test_masks_of_any_size_are_bounded() -> None:
+def test_masks_of_any_size_are_bounded(tmp_path: Path) -> None:
     with pytest.raises(ShapeError, match="20000 x 20000 pixels: scale it down"):
         Prism.from_mask(np.broadcast_to(np.uint8(1), (20_000, 20_000)), 1e-5)
+    Image.new("1", (7_000, 6_000)).save(tmp_path / "mask.png")
+    with pytest.raises(ShapeError, match="7000 x 6000 pixels: scale it down to 40 million"):
+        read_silhouette_image(tmp_path / "mask.png")

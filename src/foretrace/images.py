@@ -75,7 +75,11 @@ class StoredImage:
 
 
 def read_image(
-    path: str | Path, error: type[ForetraceError], upright: bool = False, remedy: str = REMEDY
+    path: str | Path,
+    error: type[ForetraceError],
+    upright: bool = False,
+    remedy: str = REMEDY,
+    most: int = MOST_PIXELS,
 ) -> StoredImage:
     """The image in a file.
 
@@ -84,6 +88,7 @@ def read_image(
         error: The class to raise.
         upright: Turn it as its orientation tag says, as viewers do; otherwise its pixels are the sensor's.
         remedy: What to do about a file that cannot be read; ends the message.
+        most: Images of more pixels are refused.
 
     Raises:
         ForetraceError: Of the given class: the file is missing, damaged, cut off, too large, of an unknown format or
@@ -95,7 +100,7 @@ def read_image(
             found = "is a folder" if path.is_dir() else "is no file" if path.exists() else "does not exist"
             raise error(f"cannot read an image from {path}, which {found}: {remedy}")
         with open(path, "rb") as stream:
-            return _decode(stream, path, error, upright)
+            return _decode(stream, path, error, upright, most)
     except (OSError, ValueError) as reason:
         why = getattr(reason, "strerror", None) or reason
         raise error(f"cannot read an image from {path} ({why}): {remedy}") from None
@@ -113,7 +118,7 @@ def decode_image(data: bytes, source: str | Path, error: type[ForetraceError]) -
         ForetraceError: As `read_image`.
     """
     try:
-        return _decode(io.BytesIO(data), source, error, upright=False)
+        return _decode(io.BytesIO(data), source, error)
     except ValueError as reason:
         raise error(f"{source} cannot be decoded ({reason}): record or copy it again") from None
 
@@ -137,7 +142,13 @@ def check_pixels(
         )
 
 
-def _decode(stream: Stream, source: str | Path, error: type[ForetraceError], upright: bool) -> StoredImage:
+def _decode(
+    stream: Stream,
+    source: str | Path,
+    error: type[ForetraceError],
+    upright: bool = False,
+    most: int = MOST_PIXELS,
+) -> StoredImage:
     """The image in a file.
 
     Raises:
@@ -149,7 +160,7 @@ def _decode(stream: Stream, source: str | Path, error: type[ForetraceError], upr
     with _quiet(), _mute() if start[:4] in TIFF else nullcontext():
         try:
             with Image.open(stream, formats=FORMATS) as image:
-                check_pixels(source, image.height, image.width, error)
+                check_pixels(source, image.height, image.width, error, most)
                 if (frames := _frames(image)) > 1:
                     raise error(f"{source} holds {frames} images: give a file of one")
                 return _oriented(image, stream, upright)
@@ -157,7 +168,7 @@ def _decode(stream: Stream, source: str | Path, error: type[ForetraceError], upr
             raise
         except UnidentifiedImageError:
             if start[:4] in TIFF:
-                return _decode_tiff(stream, source, error)
+                return _decode_tiff(stream, source, error, most)
             heic = start[4:11] in (b"ftyphei", b"ftyphev", b"ftypmif")
             why = (
                 "it is HEIC"
@@ -280,7 +291,7 @@ def _decode_cv(stream: Stream) -> StoredImage:
     return StoredImage(values[..., 2::-1], values[..., 3] if values.shape[2] == 4 else None)
 
 
-def _decode_tiff(stream: Stream, source: str | Path, error: type[ForetraceError]) -> StoredImage:
+def _decode_tiff(stream: Stream, source: str | Path, error: type[ForetraceError], most: int) -> StoredImage:
     """A TIFF file whose kind of values Pillow does not know, such as floating point numbers of 64 bits.
 
     Raises:
@@ -296,7 +307,7 @@ def _decode_tiff(stream: Stream, source: str | Path, error: type[ForetraceError]
         strips = list(zip(directory.get(STRIPOFFSETS, ()), directory.get(STRIPBYTECOUNTS, ()), strict=True))
     except Exception:  # as above
         raise ValueError(DAMAGED) from None
-    check_pixels(source, rows, columns, error)
+    check_pixels(source, rows, columns, error, most)
     if any(offset + count > stream.seek(0, os.SEEK_END) for offset, count in strips):
         raise ValueError(DAMAGED)
     return _decode_cv(stream)

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Num, Shaped
 from foretrace.errors import ShapeError
 from foretrace.images import StoredImage
 
+MOST_PIXELS = 40_000_000
+"""Larger masks are refused: an outline needs no more, and they would take seconds and gigabytes."""
 ANALYSED = 2000
 """Labels are looked for in at most about so many rows and columns, of larger images in every nth."""
 THICK = 9

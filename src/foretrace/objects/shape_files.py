@@ -11,7 +11,7 @@ from foretrace.files import read_json
 from foretrace.images import read_image
 from foretrace.objects import MeshObject, ObjectModel, Prism, object_from_dict
 from foretrace.objects.mesh_files import is_mesh_file
-from foretrace.objects.object_pixels import Label, object_pixels
+from foretrace.objects.object_pixels import MOST_PIXELS, Label, object_pixels
 from foretrace.objects.polygon_files import read_polygon
 from foretrace.objects.prism import DEFAULT_HEIGHT
 
@@ -57,6 +57,6 @@ def read_silhouette_image(
         ShapeError: The file cannot be read as an image, or leaves open which is the object.
     """
     try:
-        return object_pixels(read_image(file, ShapeError, upright=True), label, invert)
+        return object_pixels(read_image(file, ShapeError, upright=True, most=MOST_PIXELS), label, invert)
     except ShapeError as error:
         raise ShapeError(str(error) if str(file) in str(error) else f"{file}: {error}") from None

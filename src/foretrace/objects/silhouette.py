@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from foretrace.errors import ForetraceError, ShapeError, is_number
 from foretrace.geometry import cross, mask_outline, polygon_area
 from foretrace.images import StoredImage, check_pixels
-from foretrace.objects.object_pixels import SPECK, Label, object_pixels
+from foretrace.objects.object_pixels import MOST_PIXELS, SPECK, Label, object_pixels
 
 CUT_OFF = 0.25
 """An object that touches the border along more than this share of its extent is taken to be cut off."""
@@ -40,8 +40,6 @@ LEAST_SINE = 0.17
 """Corners sharper than 20 degrees are put back no further than one of these."""
 FINEST, COARSEST = 1e-6, 0.1
 """Sides of the smallest and of the largest pixels of images [m]."""
-MOST_PIXELS = 40_000_000
-"""Larger masks are refused: an outline needs no more, and they would take seconds and gigabytes."""
 LIKELY_SIZES = (0.02, 0.4)
 """Objects that are levered are no smaller and no larger, as a rule [m]."""
 LOST_AREA = 0.03
@@ -66,7 +64,9 @@ def read_silhouette(
     if not isinstance(mask, np.ndarray) or mask.dtype.kind not in "buif":
         raise ShapeError(f"mask of type {type(mask).__name__}: give an array of numbers, rows x columns")
     if mask.ndim != 2:
-        raise ShapeError(f"mask has shape {mask.shape}: give one channel, rows x columns")
+        raise ShapeError(
+            f"mask has shape {mask.shape}: give one channel, rows x columns, such as a cut-out's last, its alpha"
+        )
     check_pixels("mask", mask.shape[0], mask.shape[1], ShapeError, MOST_PIXELS)
     return _one_object(object_pixels(StoredImage(mask), label, invert))
 
