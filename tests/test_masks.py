@@ -186,7 +186,7 @@ def test_bad_input_is_refused_with_a_reason(share: np.ndarray) -> None:
         masks.find_table(np.random.default_rng(0).uniform(0.4, 2.0, (480, 640)), CAMERA)
     with pytest.raises(PerceptionError, match="check both"):
         place_object(mask, CAMERA, camera_pose(), 0.9)
-    with pytest.raises(PerceptionError, match="from the object's outline"):
+    with pytest.raises(PerceptionError, match="from the outline"):
         observe(placed(), np.array([0.2, 0.2]))
     seen = place_object(mask, CAMERA, camera_pose(), PRISM.height)
     with pytest.raises(PerceptionError, match="overlaps the given object's"):
