@@ -231,8 +231,8 @@ class MeshObject(ObjectModel):
         fault = (volume - as_solid(*self._bevelled).volume()) / float(self._mesh.volume)
         if not abs(fault) <= VOLUME_TOLERANCE:
             raise ShapeError(
-                f"{len(pieces)} convex pieces of the mesh miss its volume by {100 * fault:+.2g} %: thin curved walls need "
-                "too many; thicken them, or give a coarser mesh"
+                f"{len(pieces)} convex pieces of the mesh miss its volume by {100 * fault:+.2g} %: thin curved walls "
+                "need too many; thicken them, or give a coarser mesh"
             )
         return bevelled
 
