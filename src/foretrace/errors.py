@@ -10,6 +10,8 @@ from numbers import Integral, Real
 from reprlib import Repr
 from typing import Any
 
+LONGEST = 600
+"""Longest message; of a longer one the middle is left out, since it ends with the remedy."""
 SHOWN = 80
 """Longest form of a value in a message."""
 _SHORT = Repr()
@@ -18,11 +20,17 @@ for _limit in ("dict", "list", "tuple", "set", "frozenset", "deque", "array", "l
 
 
 class ForetraceError(Exception):
-    """Base of every error that foretrace raises on purpose. Its message is one line, whatever it quotes."""
+    """Base of every error that foretrace raises on purpose.
+
+    Its message is one line of at most `LONGEST` characters, whatever it quotes.
+    """
 
     def __str__(self) -> str:
         message = super().__str__()
-        return " ".join(message.split()) if "\n" in message else message
+        if "\n" in message:
+            message = " ".join(message.split())
+        half = LONGEST // 2 - 3
+        return message if len(message) <= LONGEST else f"{message[:half]} ... {message[-half:]}"
 
 
 class CommandError(ForetraceError):

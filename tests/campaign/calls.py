@@ -211,21 +211,19 @@ def table() -> dict[str, Call]:
     import foretrace as ft
     from foretrace.interactions import splits
     from foretrace.interactions.pinhole import PinholeCamera
-    from foretrace.perception import importing, masks, photo, tracking
+    from foretrace.perception import importing, photo, tracking
     from foretrace.perception.calibration import Board
     from foretrace.simulation.lens import Faults
     from foretrace.simulation.randomisation import Randomisation
     from foretrace.simulation.recording import RecordingConfig
-    from foretrace.trajectories import final_distance, mean_distance
 
     box, action, view, mask = (thing(name) for name in ("box", "action", "view", "mask"))
     predictor, effect, data = thing("predictor"), thing("effect"), thing("data")
     mesh = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.05]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    paths = np.zeros((2, 10, 3))
     tool = {"embodiment": "tool"}
     settings: tuple[Callable[..., Any], ...] = (
-        *(ft.ToolPath, ft.Physics, ft.SimulationConfig, ft.CollectConfig, ft.TrainConfig, ft.LstmConfig),
+        *(ft.ToolPath, ft.SimulationConfig, ft.CollectConfig, ft.TrainConfig, ft.LstmConfig),
         *(ft.OneShotConfig, ft.Bevel, PinholeCamera, Board, photo.PhotoConfig, importing.ImportConfig),
         *(tracking.TrackConfig, Faults, Randomisation, RecordingConfig),
     )
@@ -311,23 +309,12 @@ def table() -> dict[str, Call]:
         "split_by_object": Call(
             splits.split_by_object, {"object_ids": np.arange(20), "seed": 0, "fractions": (0.8, 0.1, 0.1)}, share=2
         ),
-        "mean_distance": Call(mean_distance, {"a": paths, "b": paths + 1}, share=1),
-        "final_distance": Call(final_distance, {"a": paths, "b": paths + 1}, share=1),
-        "mask_by_threshold": Call(
-            masks.mask_by_threshold, {"image": np.uint8(_photograph()), "dark_object": None}, share=2
-        ),
     }  # fmt: skip
 
 
 def _cloud() -> np.ndarray:
     x, y = np.meshgrid(np.linspace(0.0, 0.1, 60), np.linspace(-0.05, 0.05, 60))
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.02)], axis=1)
-
-
-def _photograph() -> np.ndarray:
-    image = np.full((90, 120, 3), 30)
-    image[20:60, 30:90] = 220
-    return image
 
 
 def _defaults(settings: Callable[..., Any]) -> dict[str, Any]:

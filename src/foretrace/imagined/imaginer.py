@@ -215,6 +215,8 @@ class Imaginer(ABC):
         check_type("view", view, TopDownView, PredictionError)
         check_object(view.mask, view.height)
         check_type("actions", actions, Iterable, PredictionError, "a list of actions")
+        if getattr(actions, "ndim", 1) == 0:  # an array of one thing says that it can be gone through
+            raise PredictionError("actions are one value: give a list of actions")
         actions = tuple(actions)
         if not actions:
             raise PredictionError("there is no candidate to imagine: give at least one action")

@@ -49,7 +49,7 @@ class ObservedMotion:
         ):
             array = (
                 None
-                if values is None
+                if values is None and name == "com"
                 else finite_array(f"{name} of an observed motion", values, shape, PredictionError)
             )
             object.__setattr__(self, name, array)

@@ -141,9 +141,10 @@ class Dataset:
                 kept &= found
                 continue
             several = isinstance(wanted, list | tuple | set | frozenset | range | np.ndarray)
+            several = several and np.ndim(wanted) > 0 if isinstance(wanted, np.ndarray) else several
             values = list(wanted) if several else [wanted]
             if name == "outcome" and (
-                odd := [value for value in values if value not in self._outcome_names()]
+                odd := [value for value in values if str(value) not in self._outcome_names()]
             ):
                 raise DatasetError(f"no outcome {odd[0]!r}: choose from {', '.join(self._outcome_names())}")
             texts = column.dtype.kind in "OU"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from msgspec import Meta
 
-from foretrace.errors import PerceptionError, shown
+from foretrace.errors import PerceptionError, is_number, shown
 from foretrace.files import read_json, write_json
 from foretrace.geometry import transform_points
 from foretrace.interactions.camera_yaml import read_camera_yaml
@@ -73,10 +73,11 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "fx", "fy"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise PerceptionError(f"camera: {name} = {getattr(self, name)}, it must be positive")
+            value = getattr(self, name)
+            if not is_number(value) or not 0 < value < np.inf:
+                raise PerceptionError(f"camera: {name} = {shown(value)}, it must be positive")
         for name, size in (("cx", self.width), ("cy", self.height)):
-            if not 0 <= getattr(self, name) < size:
+            if not is_number(getattr(self, name)) or not 0 <= getattr(self, name) < size:
                 raise PerceptionError(
                     f"camera: {name} = {getattr(self, name)} lies outside an image of {size} pixels: "
                     "check the order of the values"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from foretrace.actions import Action, LeverUp
-from foretrace.errors import ActionError, ShapeError, ViewError, check_type, is_number
+from foretrace.errors import ActionError, ShapeError, ViewError, check_type, is_number, shown, wrong_type
 from foretrace.geometry import Numbers, mask_outline
 from foretrace.objects import ObjectModel
 from foretrace.objects.silhouette import check_scale, read_silhouette, silhouette_origin
@@ -47,7 +47,10 @@ class TopDownView:
                 values = np.array(getattr(self, name), dtype=dtype)
             except (TypeError, ValueError):
                 raise ViewError(f"{name} is {getattr(self, name)!r}: give an array of numbers") from None
-            if name == "mask" and np.isnan(given := np.asarray(self.mask, dtype=float)).any():
+            given = np.asarray(getattr(self, name))
+            if given.dtype.kind not in "biuf":
+                raise ViewError(f"{name} has values of type {given.dtype}: give an array of numbers")
+            if name == "mask" and np.isnan(given).any():
                 raise ViewError(
                     f"mask has {np.isnan(given).sum()} values that are NaN: give 0 beside the object"
                 )
@@ -149,6 +152,8 @@ class TopDownView:
         Raises:
             ViewError: if no point of the object lies in the window.
         """
+        if not is_number(minimal_height):
+            raise wrong_type(ViewError)(f"minimal_height is {shown(minimal_height)}: give a number of metres")
         points = as_points(points)
         points = points[np.isfinite(points).all(axis=1)]
         pixels = np.rint(_pixels_of(points[:, :2])).astype(int)

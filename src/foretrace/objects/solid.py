@@ -49,6 +49,7 @@ class Box(Prism):
     def __init__(self, width: float, depth: float, height: float, bevel: Bevel | None = None) -> None:
         """A block; without a bevel given, its lower rim gets one that fits, and ``NO_BEVEL`` leaves it sharp."""
         check_lengths("box", width=width, depth=depth, height=height)
+        check_size(float(np.hypot(width, depth)), height)
         corners = rectangle(width, depth)
         object.__setattr__(self, "width", float(width))
         object.__setattr__(self, "depth", float(depth))

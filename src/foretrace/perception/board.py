@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, check_ranges, check_type, is_whole, shown, wrong_type
 from foretrace.geometry import invert_transform
 from foretrace.interactions.marker_patterns import dictionary
 from foretrace.interactions.pinhole import PinholeCamera
@@ -31,6 +31,9 @@ LEGIBLE_SQUARE = 18.0
 """Least side of a square whose marker would be seen if there were one [pixel]."""
 CHESSBOARD_PIXELS = 800
 """Width to which an image is reduced to look for a plain chessboard."""
+
+MOST = 10000
+"""Greatest number of squares along a side, and of a first marker."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,12 @@ class Board:
     """Black and white are exchanged."""
 
     def __post_init__(self) -> None:
+        whole = isinstance(self.squares, tuple | list) and all(is_whole(n, 0, MOST) for n in self.squares)
+        if not whole or len(self.squares) != 2:
+            raise wrong_type(PerceptionError)(f"squares is {shown(self.squares)}: give columns and rows")
+        check_type("dictionary", self.dictionary, str, PerceptionError, "the name of a dictionary of markers")
+        limits = {"square_length": (0.0, 1.0), "marker_length": (0.0, 1.0), "first_id": (0, MOST)}
+        check_ranges(PerceptionError, "board", self, limits, "give lengths in metres")
         columns, rows = self.squares
         if min(columns, rows) < 3:
             raise PerceptionError(f"board of {columns} x {rows} squares: at least 3 x 3 are needed")

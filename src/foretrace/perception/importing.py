@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from foretrace.actions import LeverUp, Motion, ToolPath, tool_poses
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, check_type, is_number, shown
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -70,6 +70,10 @@ class ImportConfig:
     """Whether there may be shadows, which are then separated from the object."""
 
     def __post_init__(self) -> None:
+        check_type("track", self.track, TrackConfig, PerceptionError)
+        check_type("path", self.path, ToolPath, PerceptionError)
+        if self.height is not None and not (is_number(self.height) and 0 < self.height < np.inf):
+            raise PerceptionError(f"height is {shown(self.height)}: give a positive number of metres")
         if self.start is not None and not np.isfinite(self.start):
             raise PerceptionError(f"start = {self.start}: give a time stamp of the recording in seconds")
 
@@ -90,6 +94,11 @@ class Contact:
             raise PerceptionError(
                 "the contact is given in no way, or in several: give exactly one of point, pixel and edge"
             )
+        pair = next(value for value in (self.point, self.pixel, self.edge) if value is not None)
+        if not isinstance(pair, tuple | list | np.ndarray) or not all(
+            is_number(n) and np.isfinite(n) for n in pair
+        ):
+            raise PerceptionError(f"contact of {shown(pair)}: give two numbers")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
 from msgspec import Meta
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.files import read_versioned
 from foretrace.geometry import invert_transform, planar_transform, rigid_transform, transform_points
 from foretrace.interactions.marker_patterns import DICTIONARIES, dictionary
@@ -37,6 +37,9 @@ LEAST_SLANT = np.deg2rad(15.0)
 
 LARGEST_ALIGNMENT = 6.0
 """Largest shift of a corner by an alignment that has not gone astray [pixel]."""
+
+FARTHEST = 100.0
+"""Distances of markers from the origin of their frame are at most that [m]."""
 
 
 @dataclass(frozen=True)
@@ -304,9 +307,9 @@ class MarkerLayout:
         )
         try:
             table, body = (_read_body(values[name]) for name in ("table", "object"))
+            pose = _placement(values["object_pose"]) if "object_pose" in values else None
         except ValueError as error:
             raise PerceptionError(f"{path}: {error}: {remedy}, each marker with id and side [m]") from error
-        pose = _placement(values["object_pose"]) if "object_pose" in values else None
         layout = cls(values["dictionary"], table, body, pose)
         size = dictionary(layout.dictionary).bytesList.shape[0]
         ids = layout.table.ids + layout.object.ids
@@ -324,4 +327,7 @@ def _read_body(entries: Sequence[MarkerEntries]) -> MarkerBody:
 
 def _placement(entry: Placement) -> Float[np.ndarray, "4 4"]:
     """T_body_marker of a marker that lies flat: position [m] and angle about z [degree]."""
-    return planar_transform(entry.get("position", ()), np.deg2rad(entry.get("angle_deg", 0.0)))
+    position = entry.get("position", ())
+    if any(abs(value) > FARTHEST for value in position):
+        raise ValueError(f"a position of {shown(list(position))}: give metres, up to {FARTHEST:g} m")
+    return planar_transform(position, np.deg2rad(entry.get("angle_deg", 0.0)))

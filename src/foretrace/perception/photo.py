@@ -7,12 +7,12 @@ image, from depth, or from the photograph alone.
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, is_number, is_whole, shown
 from foretrace.geometry import invert_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import CAMERA, MARKERS, read_depth, read_image
@@ -45,6 +45,20 @@ class PhotoConfig:
     """Tell shadows from the object, for background."""
     flat: bool = True
     """The object's top is level; otherwise the view has the heights of the depth image."""
+
+    def __post_init__(self) -> None:
+        if self.mask is not None and self.mask not in get_args(MaskMethod):
+            raise PerceptionError(
+                f"mask is {shown(self.mask)}: choose from {', '.join(get_args(MaskMethod))}"
+            )
+        if self.box is not None and not _is_box(self.box):
+            raise PerceptionError(f"box is {shown(self.box)}: give column, row, width and height in pixels")
+        if self.height is not None and not (is_number(self.height) and 0 < self.height < np.inf):
+            raise PerceptionError(f"height is {shown(self.height)}: give a positive number of metres")
+
+
+def _is_box(box: object) -> bool:
+    return isinstance(box, tuple | list) and len(box) == 4 and all(is_whole(n, -(2**31), 2**31) for n in box)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, is_number, shown
 from foretrace.geometry import rotation_angle
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.perception.markers import LEAST_SLANT, Detections, MarkerBody, PoseCandidate
@@ -34,6 +34,9 @@ LEAST_APART = np.deg2rad(8.0)
 """Two poses that differ by less are as good as one [rad]."""
 HUBER = 1.5
 """Largest residual that counts in full [standard deviations]."""
+
+MOST = 1e6
+"""Greatest setting, in SI units."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,10 @@ class TrackConfig:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not value > 0:
-                raise PerceptionError(f"tracking: {name} = {value}, it must be positive")
+            if not is_number(value) or not 0 < value < MOST:
+                raise PerceptionError(
+                    f"tracking: {name} = {shown(value)}: give a number above 0, in SI units"
+                )
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
-from foretrace.errors import TrainingError, check_type
+from foretrace.errors import TrainingError, check_type, shown
 from foretrace.features import FEATURES, FeatureExtractor, Option, make_features
 from foretrace.imagined.context import check_names
 from foretrace.interactions.record import Outcome
@@ -35,8 +35,8 @@ def check_choice(name: str, value: Any, choices: Any) -> None:
     Raises:
         TrainingError: Naming the setting, its value and the choices.
     """
-    if value not in tuple(choices):
-        raise TrainingError(f"{name} is {value!r}: choose from {', '.join(map(str, choices))}")
+    if not isinstance(value, str | int) or value not in tuple(choices):
+        raise TrainingError(f"{name} is {shown(value)}: choose from {', '.join(map(str, choices))}")
 
 
 def check_outcomes(outcomes: Any) -> None:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from foretrace.errors import SimulationError, check_ranges
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.simulation.camera import compile_with_camera, make_renderer, render
 
@@ -30,6 +31,16 @@ class Faults:
     """Scale of the depth noise that Nguyen et al. (2012) measured on a Kinect."""
     depth_holes: float = 0.01
     """Share of the pixels without depth."""
+
+    def __post_init__(self) -> None:
+        limits = {
+            "blur": (0, 20),
+            "noise": (0, 255),
+            "flicker": (0, 1),
+            "depth_noise": (0, 100),
+            "depth_holes": (0, 1),
+        }
+        check_ranges(SimulationError, "film", self, limits, "choose a value in this range")
 
 
 class LensCamera:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from foretrace.actions import CONTACT_TOLERANCE, ToolPath
-from foretrace.errors import SimulationError, check_ranges
+from foretrace.errors import SimulationError, check_ranges, is_number, shown, wrong_type
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.objects import Bevel, Box, ObjectModel, Prism
 
@@ -64,6 +64,11 @@ class Randomisation:
         for name in RANGES:
             if (limits := getattr(self, name)) is None:
                 continue
+            pair = isinstance(limits, tuple | list) and len(limits) == 2 and all(map(is_number, limits))
+            if not pair:
+                raise wrong_type(SimulationError)(
+                    f"randomisation: {name} is {shown(limits)}: give a least and a greatest number"
+                )
             low, high = limits
             if not 0 < low <= high < np.inf:
                 raise SimulationError(

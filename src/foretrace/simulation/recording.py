@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float, UInt8
 
 from foretrace.actions import LeverUp, Motion
-from foretrace.errors import SimulationError, check_ranges
+from foretrace.errors import SimulationError, check_ranges, check_type
 from foretrace.files import write_json
 from foretrace.geometry import (
     invert_transform,
@@ -104,6 +104,9 @@ class RecordingConfig:
     """How the lever-up is simulated; MuJoCo alone can record."""
 
     def __post_init__(self) -> None:
+        check_type("simulation", self.simulation, SimulationConfig, SimulationError)
+        check_type("camera", self.camera, PinholeCamera, SimulationError)
+        check_type("faults", self.faults, Faults, SimulationError)
         if self.simulation.engine != "mujoco":
             raise SimulationError(f"engine {self.simulation.engine!r} cannot record: take mujoco")
         check_ranges(SimulationError, "film", self.camera, WIDTH_RANGE, WITHIN)
