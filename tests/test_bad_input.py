@@ -5,6 +5,7 @@
 import json
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -267,3 +268,38 @@ def test_one_row_of_a_batch_is_a_batch():
     np.testing.assert_array_equal(batch[-1].com, batch.com[3:])
     check(DatasetError, "[4] chooses no rows of 4", lambda: batch[4])
     check(DatasetError, "slice('a', None, None) chooses no rows", lambda: batch["a":])
+
+
+WRONG: tuple[Any, ...] = (None, 3.5, "x", [1], object(), np.zeros(3), int, {"a": 1}, b"x", (k for k in "ab"))
+DOORS = {
+    "outline": lambda value: ft.Prism(value),
+    "mesh": lambda value: ft.MeshObject.load(value),
+    "contact": lambda value: ft.LeverUp(value, (1, 0)),
+    "point": lambda value: ft.LeverUp.nearest(BOX, value),
+    "described action": lambda value: ft.LeverUp.from_dict(value),
+    "mask": lambda value: ft.TopDownView(value, VIEW.height),
+    "scale": lambda value: ft.TopDownView(
+        VIEW.mask, VIEW.height, None if isinstance(value, float) else value
+    ),
+    "data set": lambda value: ft.Dataset.open(value),
+    "views": lambda value: ft.InteractionBatch.from_views(value),
+    "corners": lambda value: ft.InteractionBatch.from_views(
+        [VIEW], corners=value if value is not None else 1
+    ),
+    "motion": lambda value: ft.ObservedMotion(value, value),
+    "epochs": lambda value: ft.TrainConfig(epochs=value),
+    "device": lambda value: ft.TrainConfig(device=value),
+    "simulated": lambda value: simulate(obj=value),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_no_wrong_type_passes_a_door(door, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    types = set()
+    for value in WRONG:
+        with pytest.raises(ft.ForetraceError) as caught:
+            DOORS[door](value)
+        assert "\n" not in str(caught.value)
+        types.add(isinstance(caught.value, TypeError))
+    assert True in types

@@ -112,7 +112,9 @@ def check_ranges(
         value = getattr(thing, name)
         number = is_number(value) or getattr(value, "ndim", None) == 0
         if not (number and low <= value <= high):
-            raise error(f"{what}: {name} = {shown(value)} is outside {low:g} to {high:g}: {remedy}")
+            raise fault(error, bool(number))(
+                f"{what}: {name} = {shown(value)} is outside {low:g} to {high:g}: {remedy}"
+            )
 
 
 def check_type(
@@ -157,6 +159,11 @@ def wrong_type(error: type[ForetraceError]) -> type[ForetraceError]:
         return error
     members = {"__module__": error.__module__, "__reduce__": lambda self: (_rebuilt, (error, self.args))}
     return type(error.__name__, (error, TypeError), members)
+
+
+def fault(error: type[ForetraceError], right_type: bool) -> type[ForetraceError]:
+    """The class of the error about a value that is of the right type, or of a wrong one."""
+    return error if right_type else wrong_type(error)
 
 
 def _rebuilt(error: type[ForetraceError], arguments: tuple[Any, ...]) -> ForetraceError:

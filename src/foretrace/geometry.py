@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from foretrace.errors import ForetraceError
+from foretrace.errors import ForetraceError, shown, wrong_type
 
 Numbers = np.ndarray | Sequence[Any]
 """What users may give for an array: an array, or lists or tuples of numbers, nested."""
@@ -33,8 +33,10 @@ def finite_array(
     wanted = f"numbers in the shape {tuple('n' if n is None else n for n in shape)}" if shape else "a number"
     try:
         array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise error(f"{name} must be {wanted}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise wrong_type(error)(f"{name} must be {wanted}, not {shown(values)}") from None
+    if np.asarray(values).dtype.kind not in "biuf":
+        raise wrong_type(error)(f"{name} must be {wanted}, not {shown(values)}")
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         raise error(f"{name} must be {wanted}, not in the shape {array.shape}")
     if not (finite := np.isfinite(array)).all():

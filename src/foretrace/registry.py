@@ -5,7 +5,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
-from foretrace.errors import ForetraceError
+from foretrace.errors import ForetraceError, shown
 
 T = TypeVar("T")
 
@@ -58,7 +58,7 @@ class Registry(Mapping[str, T], Generic[T]):
             ForetraceError: Of the registry's class, if there is none.
         """
         if label not in self:
-            raise self._error(f"unknown {self.kind} {label!r}; available: {', '.join(self)}")
+            raise self._error(f"unknown {self.kind} {shown(label)}; available: {', '.join(self)}")
         return self[label]
 
     def __getitem__(self, label: str) -> T:
@@ -91,8 +91,8 @@ class Registry(Mapping[str, T], Generic[T]):
                 found = entry.load()
             except Exception as reason:  # a broken plug-in must not take everything else down
                 raise self._error(
-                    f"the {self.kind} {entry.name!r} of entry point {entry.value!r} cannot be loaded ({reason!r}): "
-                    "mend or uninstall the package that declares it"
+                    f"the {self.kind} {shown(entry.name)} of entry point {shown(entry.value)} cannot be loaded "
+                    f"({shown(reason)}): mend or uninstall the package that declares it"
                 ) from reason
             if entry.name not in self._entries and not isinstance(found, type):
                 self._entries[entry.name] = found

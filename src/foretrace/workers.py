@@ -17,7 +17,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from foretrace.errors import ForetraceError, is_whole
+from foretrace.errors import ForetraceError, is_whole, shown
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -40,7 +40,7 @@ def count_workers(workers: int | None, error: type[ForetraceError]) -> int:
     if workers is None:
         return cpu_count()
     if not is_whole(workers, 1, MOST_WORKERS):
-        raise error(f"workers is {workers!r}: give a number from 1 to {MOST_WORKERS}")
+        raise error(f"workers is {shown(workers)}: give a number from 1 to {MOST_WORKERS}")
     return workers
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions.motion import FAILED, Judgement, Motion
 from foretrace.actions.tool import Tool
-from foretrace.errors import ActionError, check_type, is_number, is_whole
+from foretrace.errors import ActionError, check_type, fault, is_number, is_whole, shown
 from foretrace.geometry import Numbers, inward_normals
 from foretrace.objects import ObjectModel
 from foretrace.registry import Registry
@@ -68,7 +68,7 @@ class Action(ABC):
         named = len(outcomes) > 0 and all(isinstance(name, str) and name for name in outcomes)
         if not named or len({*outcomes, FAILED}) <= len(outcomes):
             raise TypeError(
-                f"action {cls.label!r}: outcomes = {outcomes!r}: name some, each once, none {FAILED!r}"
+                f"action {shown(cls.label)}: outcomes = {shown(outcomes)}: name some, each once, none {shown(FAILED)}"
             )
         ACTIONS.add(cls.label, cls)
 
@@ -86,7 +86,9 @@ class Action(ABC):
         self._place(contact, direction / length)
         for name, kind in _kinds(type(self)).items():
             if not isinstance(getattr(self, name), kind):
-                raise ActionError(f"{self.label}: {name} = {getattr(self, name)!r}: give a {kind.__name__}")
+                raise ActionError(
+                    f"{self.label}: {name} = {shown(getattr(self, name))}: give a {kind.__name__}"
+                )
 
     def _place(self, contact: np.ndarray, direction: np.ndarray) -> None:
         for name, vector in (("contact", contact), ("direction", direction)):
@@ -147,10 +149,12 @@ class Action(ABC):
         num_edges = len(obj.corners)
         if not is_whole(edge, 0, num_edges - 1):
             raise ActionError(
-                f"edge {edge!r} of an object with {num_edges} edges: choose 0 to {num_edges - 1}"
+                f"edge {shown(edge)} of an object with {num_edges} edges: choose 0 to {num_edges - 1}"
             )
         if not is_number(fraction) or not 0 < fraction < 1:
-            raise ActionError(f"fraction {fraction!r} of an edge: choose one between 0 and 1, both excluded")
+            raise ActionError(
+                f"fraction {shown(fraction)} of an edge: choose one between 0 and 1, both excluded"
+            )
         start, stop = obj.corners[edge], obj.corners[(edge + 1) % num_edges]
         return cls(start + fraction * (stop - start), inward_normals(obj.corners)[edge], **settings)
 
@@ -207,7 +211,7 @@ class Action(ABC):
         for name, value in (("ahead", ahead), ("left", left), ("turn", turn)):
             if not is_number(value) or not abs(value) <= FARTHEST:
                 raise ActionError(
-                    f"{name} is {value!r}: give a number of metres or radians, up to {FARTHEST:g}"
+                    f"{name} is {shown(value)}: give a number of metres or radians, up to {FARTHEST:g}"
                 )
         x, y = self.direction
         contact = self.contact + ahead * np.array([x, y]) + left * np.array([-y, x])
@@ -249,7 +253,7 @@ class Action(ABC):
             )  # finite, and of a length, or refused above
         except (KeyError, TypeError, ValueError) as reason:
             raise ActionError(
-                f"action {kind.label!r} cannot be read ({reason!r}): write it with to_dict"
+                f"action {shown(kind.label)} cannot be read ({shown(reason)}): write it with to_dict"
             ) from None
         if abs(np.linalg.norm(direction) - 1) > UNIT_TOLERANCE:
             raise ActionError(
@@ -286,10 +290,10 @@ def plane_vector(name: str, values: Any) -> Float[np.ndarray, "2"]:
     try:
         vector = np.array(values, dtype=float)
     except (TypeError, ValueError):
-        vector = np.array([np.nan])
+        vector = np.zeros(0)
     if vector.shape != (2,) or not np.isfinite(vector).all():
-        shown = " ".join(str(np.asarray(values, dtype=object).tolist()).split())
-        raise ActionError(f"{name} {shown}: expected two finite numbers, object frame")
+        text = shown(values.tolist() if isinstance(values, np.ndarray) else values)
+        raise fault(ActionError, vector.size > 0)(f"{name} {text}: expected two finite numbers, object frame")
     return vector
 
 

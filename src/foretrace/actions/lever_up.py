@@ -11,7 +11,7 @@ from foretrace.actions.base import Action, minimum_jerk
 from foretrace.actions.lever_up_judge import Outcome, judge_lever_up
 from foretrace.actions.motion import FAILED, Judgement, Motion
 from foretrace.actions.tool import Screwdriver
-from foretrace.errors import ActionError, check_ranges, is_number
+from foretrace.errors import ActionError, check_ranges, is_number, shown
 from foretrace.objects import ObjectModel
 
 APPROACH = (0.0035, 0.002, 0.3)
@@ -89,7 +89,9 @@ class ToolPath:
             ActionError: If the speed is not above 0, or too high.
         """
         if not is_number(speed) or not speed > 0:
-            raise ActionError(f"tool path: speed = {speed!r} times the nominal one: give a number above 0")
+            raise ActionError(
+                f"tool path: speed = {shown(speed)} times the nominal one: give a number above 0"
+            )
         return replace(self, insert_time=self.insert_time / speed, lift_time=self.lift_time / speed)
 
     def at(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3"]:

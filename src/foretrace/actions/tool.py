@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.errors import ActionError, check_ranges, check_type
+from foretrace.errors import ActionError, check_ranges, check_type, shown
 from foretrace.registry import Registry
 
 Point = tuple[float, float, float]
@@ -102,7 +102,7 @@ class Tool(ABC):
             return kind(**{name: value for name, value in content.items() if name != "label"})
         except TypeError as reason:
             raise ActionError(
-                f"tool {kind.label!r} cannot be read ({reason}): check its dimensions"
+                f"tool {shown(kind.label)} cannot be read ({reason}): check its dimensions"
             ) from None
 
 

@@ -19,7 +19,7 @@ from tempfile import TemporaryFile
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
-from foretrace.errors import CommandError
+from foretrace.errors import CommandError, shown
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo, StructTypeInfo
@@ -118,7 +118,7 @@ def parse(entries: Mapping[str, Entry], words: Sequence[str], program: str, abou
     if name in ("-h", "--help", ""):
         return partial(_list, entries, program, about, 0 if name else 2)
     if name not in entries:
-        raise CommandError(f"unknown command {name!r}: {_suggest(name, entries)}")
+        raise CommandError(f"unknown command {shown(name)}: {_suggest(name, entries)}")
     entry = entries[name]
     if isinstance(entry, Group):
         return parse(entry.members, rest[:-1], f"{program} {name}", entry.summary)

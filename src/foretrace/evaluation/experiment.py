@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, get_type_hints
 
-from foretrace.errors import ResultsError
+from foretrace.errors import ResultsError, shown
 from foretrace.files import short_hash
 from foretrace.registry import Registry
 
@@ -177,7 +177,9 @@ def chosen(kind: str, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
     """
     names = list(dict.fromkeys(wanted or known))
     if unknown := [name for name in names if name not in known]:
-        raise ResultsError(f"{kind} {unknown[0]!r} is unknown: choose from {', '.join(dict.fromkeys(known))}")
+        raise ResultsError(
+            f"{kind} {shown(unknown[0])} is unknown: choose from {', '.join(dict.fromkeys(known))}"
+        )
     return names
 
 

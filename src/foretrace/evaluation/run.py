@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import foretrace
-from foretrace.errors import ForetraceError, ResultsError
+from foretrace.errors import ForetraceError, ResultsError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.storage import Rows, Store, kept_identity, table_of
 from foretrace.files import as_json, versions_of
@@ -206,7 +206,7 @@ def _check_columns(trial: Trial, rows: Iterable[Row]) -> None:
         for name, value in trial.settings.items():
             if row.get(name, value) != value:
                 raise ResultsError(
-                    f"a row has {name} = {row[name]!r}, its trial has {value!r}: call the column otherwise"
+                    f"a row has {name} = {shown(row[name])}, its trial has {shown(value)}: call the column otherwise"
                 )
 
 

@@ -139,7 +139,7 @@ class Store:
         if difference := first_difference(found, self.identity):
             name, there, wanted = difference
             raise ResultsError(
-                f"{self.folder} holds results with {name} = {there!r}, asked for is {wanted!r}: {REMEDY}"
+                f"{self.folder} holds results with {name} = {shown(there)}, asked for is {shown(wanted)}: {REMEDY}"
             )
 
     def _archived(self) -> dict[Trial, Rows]:
@@ -162,7 +162,7 @@ def kept_identity(folder: Path, label: str) -> dict[str, Any]:
     identity = _read_summary(folder)["identity"]
     if identity.get("experiment") != label:
         raise ResultsError(
-            f"{folder} holds results of {identity.get('experiment')!r}, not {label!r}: choose another"
+            f"{folder} holds results of {shown(identity.get('experiment'))}, not {shown(label)}: choose another"
         )
     return identity
 
@@ -254,7 +254,7 @@ def plain(row: Mapping[str, Any]) -> dict[str, Plain]:
             raise TypeError(f"column {name} holds {value!r}: give a text or a number")
         if isinstance(value, str) and (value == "" or not isinstance(_value(value), str)):
             raise TypeError(
-                f"column {name} holds the text {value!r}, which reads like a number: word it otherwise"
+                f"column {name} holds the text {shown(value)}, which reads like a number: word it otherwise"
             )
         kept[name] = str(value) if isinstance(value, str) else value
     return kept

@@ -22,7 +22,7 @@ from jaxtyping import Int
 from matplotlib.figure import Figure
 from tyro.conf import Fixed, Suppress
 
-from foretrace.errors import ResultsError
+from foretrace.errors import ResultsError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, kept_folder
 from foretrace.evaluation.metrics import METRICS
 from foretrace.evaluation.statistics import interval
@@ -220,7 +220,7 @@ class NonFlat(Experiment):
             recipe = Recipe.of(self.predictor).change(**LARGER.get(self.predictor, {}))
         if recipe.features not in CHANNEL_OPTIONS:
             raise ResultsError(
-                f"features {recipe.features!r} of {self.predictor} do not come from both masks and height maps: "
+                f"features {shown(recipe.features)} of {self.predictor} do not come from both masks and height maps: "
                 f"choose a predictor with {' or '.join(CHANNEL_OPTIONS)}"
             )
         return recipe.change(epochs=self.epochs, device=self.device)

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tyro.conf import Fixed, Suppress
 
-from foretrace.errors import ResultsError
+from foretrace.errors import ResultsError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds
 from foretrace.evaluation.metrics import measure_errors
 from foretrace.evaluation.statistics import interval
@@ -182,7 +182,7 @@ class RandomisationExperiment(Experiment):
         for label in labels:
             if label not in FEATURES or FEATURES[label].oracle:
                 usable = ", ".join(name for name, kind in FEATURES.items() if not kind.oracle)
-                raise ResultsError(f"features {label!r} cannot be had from a view: choose from {usable}")
+                raise ResultsError(f"features {shown(label)} cannot be had from a view: choose from {usable}")
         seeds = checked_seeds(self.seeds)
         if self.plain is None and self.varied is None:
             return []

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from tyro.conf import Positional
 
-from foretrace.errors import PredictionError
+from foretrace.errors import PredictionError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.tables import markdown_table
 from foretrace.experiments import SUMMARIES
@@ -146,7 +146,8 @@ def reconstruct_masks(predictor: EffectPredictor, batch: InteractionBatch) -> Ma
     features = predictor.features
     if not isinstance(features, AutoencoderFeatures):
         raise PredictionError(
-            f"features {features.label!r} have no code to restore a mask from: give a predictor with ae-256 or ae-512"
+            f"features {shown(features.label)} have no code to restore a mask from: "
+            "give a predictor with ae-256 or ae-512"
         )
     with torch.no_grad():
         restored = features.reconstruct(features.inputs(batch).to(predictor.device))

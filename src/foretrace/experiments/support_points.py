@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, shown
 from foretrace.features import FeatureExtractor, FitPart, Option, make_features
 from foretrace.features.support_points import (
     hull_and_com,
@@ -48,7 +48,9 @@ def support_point_metrics(
             part) was observed.
     """
     if features not in CHOICES:
-        raise TrainingError(f"unknown features {features!r} for support points: choose {', '.join(CHOICES)}")
+        raise TrainingError(
+            f"unknown features {shown(features)} for support points: choose {', '.join(CHOICES)}"
+        )
     test = batch[split.test]
     test = test[np.isfinite(test.support_points).all(axis=(1, 2))]
     if len(test) == 0:

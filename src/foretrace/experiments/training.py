@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, shown
 from foretrace.files import short_hash
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.record import Outcome
@@ -71,7 +71,7 @@ class Recipe:
         own, loop = ({each.name for each in fields(part)} for part in (self.predictor, self.training))
         if odd := [name for name in given if name not in own | loop]:
             raise TrainingError(
-                f"neither the predictor nor its training has a setting {odd[0]!r}: leave it out"
+                f"neither the predictor nor its training has a setting {shown(odd[0])}: leave it out"
             )
         return Recipe(
             replace(self.predictor, **{name: value for name, value in given.items() if name in own}),

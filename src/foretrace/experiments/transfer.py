@@ -23,7 +23,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from tyro.conf import Fixed, Positional, Suppress
 
-from foretrace.errors import DatasetError, ForetraceError, PredictionError, ResultsError, ShapeError
+from foretrace.errors import DatasetError, ForetraceError, PredictionError, ResultsError, ShapeError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.training import weights_of
@@ -198,7 +198,7 @@ class Transfer(Experiment):
         if len(found) < len(subjects):
             names = [(subject.group, subject.name) for subject in subjects]
             group, name = next(each for each in names if names.count(each) > 1)
-            raise ShapeError(f"two of the {group} are called {name!r}: give every object its own name")
+            raise ShapeError(f"two of the {group} are called {shown(name)}: give every object its own name")
         return found
 
     @cached_property
@@ -249,7 +249,7 @@ def check_sees(predictor: EffectPredictor) -> None:
     """
     if predictor.features.oracle:
         raise PredictionError(
-            f"features {predictor.features.label!r} are observed during the action and cannot be had from a view: "
+            f"features {shown(predictor.features.label)} are observed during the action and cannot be had from a view: "
             "use a predictor with other features, such as im-cnn"
         )
 

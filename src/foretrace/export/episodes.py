@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.errors import ExportError, PredictionError
+from foretrace.errors import ExportError, PredictionError, shown
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.imagined import ImaginedEffect
 from foretrace.interactions.dataset import Dataset
@@ -118,7 +118,7 @@ def choose(data: Path, ids: Sequence[int] | None = None, run: Path | None = None
     predictor = None if run is None else load_predictor(run)
     if predictor is not None and predictor.features.oracle:
         raise PredictionError(
-            f"the predictor in {run} cannot imagine: its features {predictor.features.label!r} are observed during "
-            "the action; choose a run with other features"
+            f"the predictor in {run} cannot imagine: its features {shown(predictor.features.label)} are observed "
+            "during the action; choose a run with other features"
         )
     return Episodes(dataset[[row_of[id] for id in ids]], predictor)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 import foretrace
-from foretrace.errors import ExportError
+from foretrace.errors import ExportError, shown
 from foretrace.export.delivery import require
 from foretrace.export.networks import draw_inputs, network_of
 from foretrace.files import atomic_path
@@ -167,7 +167,7 @@ def _write(network: TracedPredictor, file: Path, rng: np.random.Generator) -> No
             )
     except (RuntimeError, ValueError) as error:
         raise ExportError(
-            f"the {network.predictor.label} network with features {network.predictor.features.label!r} cannot be "
+            f"the {network.predictor.label} network with features {shown(network.predictor.features.label)} cannot be "
             f"exported: {str(error).strip().splitlines()[0]}"
         ) from error
     assert program is not None

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, shown
 from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.registry import Registry, adds_anything
@@ -175,7 +175,7 @@ def make_features(label: str, **options: Option) -> FeatureExtractor:
     known = option_names(extractor)
     for name in options:
         if name not in known:
-            raise TrainingError(f"{label} has no option {name!r}; it has: {', '.join(known) or 'none'}")
+            raise TrainingError(f"{label} has no option {shown(name)}; it has: {', '.join(known) or 'none'}")
     try:
         return extractor(**options)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -8,7 +8,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, shown
 from foretrace.features.base import FeatureExtractor, ImageName, Option, TracedFeatures
 from foretrace.features.shape_context import ShapeContext3200, shape_contexts
 from foretrace.features.windows import convolve_unbranched, convolve_windows
@@ -108,7 +108,7 @@ class ImageCnn(ConvolutionalFeatures):
 
     def __init__(self, channel: ImageName = "mask", width: int = 128, dropout: float = 0.2):
         if channel not in get_args(ImageName):
-            raise TrainingError(f"channel is {channel!r}: choose from {', '.join(get_args(ImageName))}")
+            raise TrainingError(f"channel is {shown(channel)}: choose from {', '.join(get_args(ImageName))}")
         super().__init__(8 * 8 * CHANNELS[-1], width, dropout, channel=channel)
         self.channel: ImageName = channel
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Action, LeverUp
-from foretrace.errors import PredictionError, TrainingError
+from foretrace.errors import PredictionError, TrainingError, shown
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 
@@ -43,9 +43,11 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
     """
     for name in names:
         if name not in CONTEXT:
-            raise TrainingError(f"{name!r} is no context of a prediction: choose from {', '.join(CONTEXT)}")
+            raise TrainingError(
+                f"{shown(name)} is no context of a prediction: choose from {', '.join(CONTEXT)}"
+            )
         if list(names).count(name) > 1:
-            raise TrainingError(f"{name!r} is named twice in the context: name it once")
+            raise TrainingError(f"{shown(name)} is named twice in the context: name it once")
     return tuple(names)
 
 
@@ -131,20 +133,20 @@ def given_context(
     """
     context = {} if context is None else context
     if not isinstance(context, Mapping):
-        raise PredictionError(f"context is {context!r}: give values by name, as {{'friction': 0.8}}")
+        raise PredictionError(f"context is {shown(context)}: give values by name, as {{'friction': 0.8}}")
     if missing := [name for name in names if name not in parameters and name not in context]:
-        wanted = ", ".join(f"{name!r}: value {CONTEXT[name]}" for name in names)
+        wanted = ", ".join(f"{shown(name)}: value {CONTEXT[name]}" for name in names)
         raise PredictionError(
             f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}"
         )
     if odd := [name for name in context if name not in names]:
         accepted = ", ".join(names) or "nothing but the view"
         raise PredictionError(
-            f"the predictor is conditioned on {accepted}, not on {odd[0]!r}: leave it out of context"
+            f"the predictor is conditioned on {accepted}, not on {shown(odd[0])}: leave it out of context"
         )
     for name, value in context.items():
         if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
-            raise PredictionError(f"context {name} is {value!r}: give a finite value {CONTEXT[name]}")
+            raise PredictionError(f"context {name} is {shown(value)}: give a finite value {CONTEXT[name]}")
         for planned in parameters.get(name, ()):
             if abs(planned - nominal_parameters()[name]) > SAME < abs(planned - value):
                 raise PredictionError(

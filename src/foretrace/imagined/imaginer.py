@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Action
-from foretrace.errors import PredictionError, check_type
+from foretrace.errors import PredictionError, check_type, shown
 from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined.context import (
     PARAMETERS,
@@ -168,10 +168,10 @@ class Imaginer(ABC):
         check_type("batch", batch, InteractionBatch, PredictionError)
         check_arrays(batch.mask, batch.height)
         if start not in STARTS:
-            raise PredictionError(f"start is {start!r}: choose from {', '.join(STARTS)}")
+            raise PredictionError(f"start is {shown(start)}: choose from {', '.join(STARTS)}")
         most = len(self.sample_times) - 1
         if isinstance(observed, bool) or not isinstance(observed, int | np.integer) or observed < 0:
-            raise PredictionError(f"observed is {observed!r}: give a number of samples from 0 to {most}")
+            raise PredictionError(f"observed is {shown(observed)}: give a number of samples from 0 to {most}")
         for id, mask, height in zip(batch.ids, batch.mask, batch.height, strict=True):
             with _naming(f"interaction {id}: "):
                 check_object(mask, height)

@@ -13,7 +13,8 @@ import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import Action, action_transform
-from foretrace.errors import DatasetError, RowError, check_type
+from foretrace.errors import DatasetError, RowError, check_type, is_whole, shown, wrong_type
+from foretrace.geometry import finite_array
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
@@ -77,7 +78,11 @@ class InteractionBatch:
 
     def batches(self, size: int | None = None) -> Iterator["InteractionBatch"]:
         """The same in parts of a number of rows, in order; by default in one."""
-        size = size or max(1, len(self))
+        size = max(1, len(self)) if size is None else size
+        if not is_whole(size, 1, 2**63 - 1):
+            raise wrong_type(DatasetError)(
+                f"size of a batch is {shown(size)}: give a number of rows from 1 on"
+            )
         return (self[start : start + size] for start in range(0, len(self), size))
 
     @classmethod
@@ -118,8 +123,13 @@ class InteractionBatch:
         check_type("views", views, Sequence, DatasetError)
         for k, view in enumerate(views):
             check_type(f"view {k}", view, TopDownView, DatasetError)
-        n, times = len(views), np.zeros(0) if times is None else times
+        n, times = (
+            len(views),
+            np.zeros(0) if times is None else finite_array("times", times, (None,), DatasetError),
+        )
         corners = [np.zeros((0, 2))] * n if corners is None else corners
+        check_type("corners", corners, Sequence, DatasetError)
+        corners = [finite_array("corners", each, (None, 2), DatasetError) for each in corners]
         return cls(
             ids=np.arange(n),
             mask=np.array([view.mask for view in views], dtype=bool).reshape(n, VIEW_SIZE, VIEW_SIZE),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.files import read_text
 from foretrace.interactions.lens_models import FISHEYE, OPENCV, lens_of
 
@@ -91,7 +91,7 @@ def _ros_or_opencv(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _kalibr(content: Mapping[str, Any]) -> dict[str, Any]:
     if (kind := content.get("camera_model")) != "pinhole":
-        raise PerceptionError(f"camera model {str(kind)[:40]!r}, of Kalibr's models pinhole can be read")
+        raise PerceptionError(f"camera model {shown(str(kind)[:40])}, of Kalibr's models pinhole can be read")
     fx, fy, cx, cy = (float(value) for value in content["intrinsics"])
     width, height = content["resolution"]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from foretrace.actions import ACTIONS, FAILED
-from foretrace.errors import DatasetError, RowError, ShapeError, is_whole
+from foretrace.errors import DatasetError, RowError, ShapeError, is_whole, shown
 from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
@@ -146,12 +146,14 @@ class Dataset:
             if name == "outcome" and (
                 odd := [value for value in values if str(value) not in self._outcome_names()]
             ):
-                raise DatasetError(f"no outcome {odd[0]!r}: choose from {', '.join(self._outcome_names())}")
+                raise DatasetError(
+                    f"no outcome {shown(odd[0])}: choose from {', '.join(self._outcome_names())}"
+                )
             texts = column.dtype.kind in "OU"
             for value in values:
                 if isinstance(value, str) != texts or not np.isscalar(value):
                     raise DatasetError(
-                        f"{name} is compared with {value!r}: give {'a text' if texts else 'a number'}"
+                        f"{name} is compared with {shown(value)}: give {'a text' if texts else 'a number'}"
                     )
             kept &= np.isin(column, values)
         return self if kept.all() else self._view(np.flatnonzero(kept))
@@ -182,7 +184,7 @@ class Dataset:
             DatasetError: Two of them were sampled at different times.
         """
         if not is_whole(size, 1, 2**63 - 1):
-            raise DatasetError(f"size of a batch is {size!r}: give a number of rows from 1 on")
+            raise DatasetError(f"size of a batch is {shown(size)}: give a number of rows from 1 on")
         for table in self._pieces(size=size):
             yield self._batch(table)
             pa.default_memory_pool().release_unused()
@@ -241,7 +243,7 @@ class Dataset:
         if name not in self.parameters:
             names = [*scalars, *self.parameters]
             close = get_close_matches(name, names, n=3) or names
-            raise DatasetError(f"no column {name!r} to filter by: choose from {', '.join(close)}")
+            raise DatasetError(f"no column {shown(name)} to filter by: choose from {', '.join(close)}")
         return self.parameters[name]
 
     @cached_property

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 
 OPENCV = ("plumb_bob", "rational_polynomial")
 BROWN = ("radtan", "brown_conrady")
@@ -34,11 +34,11 @@ def lens_of(model: str, coefficients: Sequence[float]) -> tuple[tuple[float, ...
     values = np.asarray(coefficients, dtype=float).ravel()
     bent = bool((values != 0).any())  # NaN counts
     if name in STRAIGHT and bent:
-        said = f"the distortion model {model!r}" if name else "no distortion model"
+        said = f"the distortion model {shown(model)}" if name else "no distortion model"
         raise PerceptionError(f"{said} has coefficients {_few(values)}")
     if name not in SIZES:
         raise PerceptionError(
-            f"distortion model {model[:40]!r} is none of {', '.join((*OPENCV, *BROWN, *FISHEYE))}"
+            f"distortion model {shown(model[:40])} is none of {', '.join((*OPENCV, *BROWN, *FISHEYE))}"
         )
     if not bent:  # a fisheye lens bends with zeros, too
         return ((0.0,) * 4, True) if name in FISHEYE else ((), False)

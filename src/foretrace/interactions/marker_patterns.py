@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 
 DICTIONARIES: dict[str, int] = {
     **{
@@ -47,7 +47,7 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
     name = name.lower()
     if name not in DICTIONARIES:
         raise PerceptionError(
-            f"marker dictionary {name!r} is unknown: choose one of {', '.join(DICTIONARIES)}"
+            f"marker dictionary {shown(name)} is unknown: choose one of {', '.join(DICTIONARIES)}"
         )
     found = cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
     if name not in PUBLISHED:

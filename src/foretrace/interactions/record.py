@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from foretrace.actions import Action, Judgement, Motion
 from foretrace.actions import Outcome as Outcome
-from foretrace.errors import ActionError
+from foretrace.errors import ActionError, shown
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 
@@ -68,11 +68,11 @@ class Effect:
         judgement = action.judge(motion, obj, com)
         if not isinstance(judgement, Judgement):
             raise ActionError(
-                f"action {action.label!r} was judged {judgement!r}: its judge is to return a Judgement"
+                f"action {shown(action.label)} was judged {shown(judgement)}: its judge is to return a Judgement"
             )
         if judgement.outcome not in action.outcomes:
             raise ActionError(
-                f"action {action.label!r} was judged {judgement.outcome!r}, which is none of its outcomes: "
+                f"action {shown(action.label)} was judged {shown(judgement.outcome)}, which is none of its outcomes: "
                 f"{', '.join(action.outcomes)}"
             )
         support = judgement.support_points

@@ -46,10 +46,13 @@ class TopDownView:
             try:
                 values = np.array(getattr(self, name), dtype=dtype)
             except (TypeError, ValueError):
-                raise ViewError(f"{name} is {getattr(self, name)!r}: give an array of numbers") from None
+                wrong = wrong_type(ViewError)
+                raise wrong(f"{name} is {shown(getattr(self, name))}: give an array of numbers") from None
             given = np.asarray(getattr(self, name))
             if given.dtype.kind not in "biuf":
-                raise ViewError(f"{name} has values of type {given.dtype}: give an array of numbers")
+                raise wrong_type(ViewError)(
+                    f"{name} has values of type {given.dtype}: give an array of numbers"
+                )
             if name == "mask" and np.isnan(given).any():
                 raise ViewError(
                     f"mask has {np.isnan(given).sum()} values that are NaN: give 0 beside the object"
@@ -58,7 +61,7 @@ class TopDownView:
                 raise ViewError(f"{name} of shape {values.shape}: expected ({VIEW_SIZE}, {VIEW_SIZE}) pixels")
             object.__setattr__(self, name, values)
         scale = self.metres_per_pixel
-        if scale != METRES_PER_PIXEL:
+        if not is_number(scale) or scale != METRES_PER_PIXEL:
             check_scale(scale, ViewError)
             if self.mask[[0, -1]].any() or self.mask[:, [0, -1]].any():
                 raise ViewError(
@@ -120,7 +123,7 @@ class TopDownView:
         """
         check_scale(metres_per_pixel, ViewError)
         if not is_number(height) or not 0 < height < np.inf:
-            raise ViewError(f"height is {height!r}: give a positive number of metres")
+            raise ViewError(f"height is {shown(height)}: give a positive number of metres")
         try:
             silhouette = read_silhouette(mask)
             action = LeverUp(contact, direction)

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
-from foretrace.errors import ActionError, DatasetError
+from foretrace.errors import ActionError, DatasetError, shown
 from foretrace.files import remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.record import ExecutionOffset, Physics, Provenance
@@ -95,7 +95,9 @@ def _converted(folder: Path, name: str, manifest: Mapping[str, Any]) -> tuple[pa
         rows = [_row(row, manifest["configuration"]) for row in table.to_pylist()]
         return storage.to_table(rows), None
     except (KeyError, TypeError, ValueError, ActionError, pa.ArrowException) as reason:
-        raise DatasetError(f"shard {folder / name} cannot be upgraded ({reason!r}): {remedy}") from reason
+        raise DatasetError(
+            f"shard {folder / name} cannot be upgraded ({shown(reason)}): {remedy}"
+        ) from reason
 
 
 def _row(row: dict[str, Any], configuration: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,8 @@ import shapely
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
-from foretrace.errors import ShapeError, is_number
+from foretrace.errors import ShapeError, is_number, shown
+from foretrace.files import as_path
 from foretrace.geometry import Numbers, convex_hull, finite_array, inward_normals, polygon_area
 from foretrace.objects.decomposition import as_solid, cached_pieces, surface_of
 from foretrace.objects.mesh_bodies import is_convex_body, one_solid
@@ -108,8 +109,8 @@ class MeshObject(ObjectModel):
             ShapeError: if the file cannot be read or the mesh is not usable.
         """
         if not (is_number(scale) and 0 < scale < np.inf):
-            raise ShapeError(f"scale is {scale!r}: give the metres per unit of the mesh, e.g. 0.001")
-        vertices, faces = read_mesh(Path(path))
+            raise ShapeError(f"scale is {shown(scale)}: give the metres per unit of the mesh, e.g. 0.001")
+        vertices, faces = read_mesh(as_path(path, ShapeError))
         try:
             check_precision(vertices)
             vertices, faces = one_solid(vertices, faces)

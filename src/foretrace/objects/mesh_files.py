@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from foretrace.errors import ForetraceError, ShapeError
+from foretrace.errors import ForetraceError, ShapeError, shown
 from foretrace.geometry import polygon_area
 from foretrace.objects.decomposition import Faces, Points
 from foretrace.objects.model import SIZE_LIMITS
@@ -60,7 +60,7 @@ def read_mesh(path: Path, error: type[ForetraceError] = ShapeError) -> tuple[Poi
     if not path.is_file():
         raise error(f"mesh file {path} does not exist: check the path")
     if kind not in READABLE:
-        held = f" holds {OTHERS[kind]}" if kind in OTHERS else f" ends in {kind!r}"
+        held = f" holds {OTHERS[kind]}" if kind in OTHERS else f" ends in {shown(kind)}"
         raise error(f"mesh file {path}{held}: export it as STL, OBJ, PLY or OFF")
     if (size := path.stat().st_size) > LARGEST_FILE:
         raise error(f"mesh file {path} has {size / 1e6:.0f} MB: simplify it in a mesh editor")

@@ -34,7 +34,9 @@ class Bevel:
 
     def __post_init__(self) -> None:
         if not (is_number(self.width) and is_number(self.height)):
-            raise ShapeError(f"bevel of {self.width!r} x {self.height!r}: give two numbers of metres")
+            raise ShapeError(
+                f"bevel of {shown(self.width)} x {shown(self.height)}: give two numbers of metres"
+            )
         if not (np.isfinite([self.width, self.height]).all() and min(self.width, self.height) >= 0):
             raise ShapeError(f"bevel of {self.width} m x {self.height} m: both must be finite and at least 0")
         if (self.width == 0) != (self.height == 0):

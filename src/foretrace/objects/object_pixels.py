@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Num, Shaped
 
-from foretrace.errors import ShapeError
+from foretrace.errors import ShapeError, shown
 from foretrace.images import StoredImage
 
 MOST_PIXELS = 40_000_000
@@ -100,13 +100,13 @@ def _labelled(
     """Pixels of a label."""
     wanted = np.atleast_1d(np.asarray(label))
     if wanted.dtype.kind not in "iuf" or wanted.shape not in ((1,), (3,)):
-        raise ShapeError(f"label {label!r}: give a number, or red, green and blue")
+        raise ShapeError(f"label {shown(label)}: give a number, or red, green and blue")
     if wanted.size == 1 and palette is not None:
         values = palette
     if wanted.size == 3 and values.ndim == 2:
         wanted = wanted[[0]] if (wanted == wanted[0]).all() else np.array([np.nan])
     if wanted.size == 1 and values.ndim == 3:
-        raise ShapeError(f"label {label!r} in a mask of colours: give red, green and blue")
+        raise ShapeError(f"label {shown(label)} in a mask of colours: give red, green and blue")
     found = values == wanted[0] if values.ndim == 2 else (values == wanted).all(axis=2)
     labels, exact = _labels(values)
     if not exact:

@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from foretrace.errors import ShapeError
+from foretrace.errors import ShapeError, shown
 from foretrace.files import read_text
 from foretrace.objects.model import SIZE_LIMITS
 
@@ -62,7 +62,7 @@ def read_polygon(file: Path, scale: float | None = None) -> Float[np.ndarray, "n
     else:
         corners, unit = _table(file, text)
     if scale is not None and not (math.isfinite(scale) and scale > 0):
-        raise ShapeError(f"scale of {scale!r} metres per unit: give a positive number")
+        raise ShapeError(f"scale of {shown(scale)} metres per unit: give a positive number")
     corners = corners * (scale or unit or 1.0)
     if scale is None and unit is None:
         _check_unit(file, corners, mapped)
@@ -179,12 +179,12 @@ def _read(
             wanted = 'columns parted by ";" where numbers have decimal commas'
             parted = delimiter == "," and "." not in row.text
             fault = fault or (
-                f"{place}: {row.text!r:.60} has {len(cells)} entries: {wanted if parted else REMEDY}"
+                f"{place}: {shown(row.text)} has {len(cells)} entries: {wanted if parted else REMEDY}"
             )
         elif None in values:
             column = chosen[values.index(None)]
             cell = cells[column] if column < len(cells) else ""
-            fault = fault or f"{place}, column {column + 1}: {cell!r:.40} is no number: {REMEDY}"
+            fault = fault or f"{place}, column {column + 1}: {shown(cell)} is no number: {REMEDY}"
         else:
             found.append(values)
     far = len(found), width > 1

@@ -8,7 +8,7 @@ import shapely
 from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 
-from foretrace.errors import ShapeError, check_type, is_number, is_whole
+from foretrace.errors import ShapeError, check_type, is_number, is_whole, shown
 from foretrace.geometry import (
     Numbers,
     clip_polygon,
@@ -74,7 +74,7 @@ class Prism(ObjectModel):
     def __init__(self, corners: Numbers, height: float = DEFAULT_HEIGHT, bevel: Bevel = BEVEL) -> None:
         object.__setattr__(self, "corners", check_polygon(corners))
         if not is_number(height):
-            raise ShapeError(f"height is {height!r}: give a number of metres")
+            raise ShapeError(f"height is {shown(height)}: give a number of metres")
         check_type("bevel", bevel, Bevel, ShapeError)
         object.__setattr__(self, "height", float(height))
         object.__setattr__(self, "bevel", bevel)
@@ -118,7 +118,7 @@ class Prism(ObjectModel):
             ShapeError: for a mask that is empty, shows several objects or an object cut off by the border.
         """
         if not is_number(height):
-            raise ShapeError(f"height is {height!r}: give a number of metres")
+            raise ShapeError(f"height is {shown(height)}: give a number of metres")
         check_size(SIZE_LIMITS[0], height)
         corners = silhouette_polygon(mask, metres_per_pixel, tolerance, blunted)
         size = largest_distance(corners)
@@ -306,7 +306,7 @@ def sample_prism(rng: np.random.Generator, num_corners: int) -> Prism:
     most = int(0.5 * 2 * np.pi / SMALLEST_GAP)
     check_type("rng", rng, np.random.Generator, ShapeError)
     if not is_whole(num_corners, 3, most):
-        raise ShapeError(f"sampled polygon with {num_corners!r} corners: choose 3 to {most}")
+        raise ShapeError(f"sampled polygon with {shown(num_corners)} corners: choose 3 to {most}")
     while True:
         angles = np.sort(rng.uniform(0.0, 2 * np.pi, num_corners))
         gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
@@ -325,6 +325,6 @@ def paper_objects(seed: int = 0, per_corner_count: int = 20) -> list[Prism]:
     """
     for name, value in (("seed", seed), ("per_corner_count", per_corner_count)):
         if not is_whole(value, 0, 2**63 - 1):
-            raise ShapeError(f"{name} is {value!r}: give a whole number from 0 on")
+            raise ShapeError(f"{name} is {shown(value)}: give a whole number from 0 on")
     counts = CORNER_COUNTS * per_corner_count
     return [sample_prism(np.random.default_rng([seed, i]), count) for i, count in enumerate(counts)]

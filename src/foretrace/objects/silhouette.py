@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int, Shaped
 
-from foretrace.errors import ForetraceError, ShapeError, is_number
+from foretrace.errors import ForetraceError, ShapeError, is_number, shown
 from foretrace.geometry import cross, mask_outline, polygon_area
 from foretrace.images import StoredImage, check_pixels
 from foretrace.objects.object_pixels import MOST_PIXELS, SPECK, Label, object_pixels
@@ -130,7 +130,7 @@ def check_scale(metres_per_pixel: Any, error: type[ForetraceError]) -> None:
     """Refuse an image's scale [m] that no image has, by an error of the given class."""
     if not is_number(metres_per_pixel) or not FINEST <= metres_per_pixel <= COARSEST:
         raise error(
-            f"scale of {metres_per_pixel!r} m per pixel: give a length from {FINEST:g} to {COARSEST:g} m"
+            f"scale of {shown(metres_per_pixel)} m per pixel: give a length from {FINEST:g} to {COARSEST:g} m"
         )
 
 
@@ -175,7 +175,7 @@ def silhouette_polygon(
     check_scale(metres_per_pixel, ShapeError)
     for name, value in (("tolerance", tolerance), ("blunted", blunted)):
         if value is not None and not (is_number(value) and 0 <= value < COARSEST):
-            raise ShapeError(f"{name} is {value!r}: give a length from 0 to {COARSEST:g} m")
+            raise ShapeError(f"{name} is {shown(value)}: give a length from 0 to {COARSEST:g} m")
     silhouette = read_silhouette(mask)
     rows, columns = (mask_outline(silhouette) - silhouette_origin(silhouette)).T
     outline = np.column_stack([columns, -rows])[::-1]  # x, y in pixels, counter-clockwise

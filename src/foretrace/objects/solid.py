@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from foretrace.errors import ShapeError
+from foretrace.errors import ShapeError, shown
 from foretrace.objects.model import (
     Bevel,
     CollisionShape,
@@ -137,7 +137,7 @@ def check_lengths(kind: str, **lengths: float) -> None:
     """
     for name, value in lengths.items():
         if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0):
-            raise ShapeError(f"{kind} of {name} {value!r}: give a positive length in metres")
+            raise ShapeError(f"{kind} of {name} {shown(value)}: give a positive length in metres")
 
 
 def sample_cylinder(rng: np.random.Generator) -> Cylinder:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.images import decode_image
 
 TO_BGR = {
@@ -87,7 +87,7 @@ def _compressed_depth(message: Any, path: Path) -> Float[np.ndarray, "rows colum
     steps = decode_image(data, f"depth image ({message.format}) in bag {path}", PerceptionError).values
     if steps.dtype != np.uint16 or steps.ndim != 2:
         raise PerceptionError(
-            f"bag {path} has depth of {steps.dtype} in {message.format!r}: 16UC1 and 32FC1 can be read"
+            f"bag {path} has depth of {steps.dtype} in {shown(message.format)}: 16UC1 and 32FC1 can be read"
         )
     if encoding != "32FC1":
         return steps.astype(float) * MILLIMETRE

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import Frame
 from foretrace.perception.bag_images import is_depth, read_colour, read_depth
@@ -82,8 +82,8 @@ def open_bag(path: Path, topic: str | None = None, depth_topic: str | None = Non
             depth_topic = _chosen(path, depth_topic, depths, "depth topic", "--depth-topic")
             if depth_topic not in aligned:
                 raise PerceptionError(
-                    f"bag {path}: {depth_topic} is in frame {streams[depth_topic].frame!r}, {colour} in {frame!r}: "
-                    "record depth that is aligned with the colour images"
+                    f"bag {path}: {depth_topic} is in frame {shown(streams[depth_topic].frame)}, {colour} in "
+                    f"{shown(frame)}: record depth that is aligned with the colour images"
                 )
         depth = depth_topic or next(iter(aligned), None)
         camera, no_camera = _camera(reader, path, colour, streams[colour])

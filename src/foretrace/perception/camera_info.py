@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.interactions.lens_models import lens_of
 from foretrace.interactions.pinhole import PinholeCamera
 
@@ -64,7 +64,8 @@ def camera_of(images: Images, infos: Sequence[Info]) -> PinholeCamera:
             raise PerceptionError(f"{info.topic}: {error}") from error
     if len(set(cameras)) > 1:
         raise PerceptionError(
-            f"{_shown(info.topic for info in chosen)} differ, all in frame {images.frame!r}, none beside {images.topic}"
+            f"{_shown(info.topic for info in chosen)} differ, all in frame {shown(images.frame)}, none beside "
+            f"{images.topic}"
         )
     return cameras[0]
 
@@ -77,16 +78,16 @@ def _own(images: Images, infos: Sequence[Info]) -> list[Info]:
             continue
         if info.frame and images.frame and info.frame != images.frame:
             raise PerceptionError(
-                f"{info.topic} is of frame {info.frame[:40]!r}, {images.topic} of {images.frame[:40]!r}"
+                f"{info.topic} is of frame {shown(info.frame[:40])}, {images.topic} of {shown(images.frame[:40])}"
             )
         return [info]
     same = [
         info for info in infos if info.frame and info.frame == images.frame and not _other_side(images, info)
     ]
     if not same:
-        found = _shown(f"{info.topic} (frame {info.frame[:40]!r})" for info in infos)
+        found = _shown(f"{info.topic} (frame {shown(info.frame[:40])})" for info in infos)
         raise PerceptionError(
-            f"no camera_info belongs to {images.topic} (frame {images.frame[:40]!r}): {found}"
+            f"no camera_info belongs to {images.topic} (frame {shown(images.frame[:40])}): {found}"
         )
     return same
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.files import read_text
 from foretrace.interactions import recording_folder
 from foretrace.interactions.pinhole import PinholeCamera
@@ -117,7 +117,7 @@ def _read_times(folder: Path) -> list[tuple[float, str, str]]:
         head = [name.strip().lower() for name in next(lines, [])]
         if missing := [name for name in ("time_s", "colour") if name not in head]:
             raise PerceptionError(
-                f"{path} lacks the column {missing[0]} (its first line is {','.join(head)!r:.80}): "
+                f"{path} lacks the column {missing[0]} (its first line is {shown(','.join(head))}): "
                 f"its columns are {names}"
             )
         found = [(lines.line_num, line) for line in lines if any(line)]
@@ -143,7 +143,7 @@ def _time_and_images(place: str, head: list[str], line: list[str]) -> tuple[floa
     except ValueError:
         time = math.nan
     if not math.isfinite(time):
-        raise PerceptionError(f"{place}: time_s is {stated!r:.80}: give the time in seconds")
+        raise PerceptionError(f"{place}: time_s is {shown(stated)}: give the time in seconds")
     if not (colour := row.get("colour", "").strip()):
         raise PerceptionError(f"{place}: colour is empty: name the frame's image")
     return time, colour, row.get("depth", "").strip()

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, shown
 from foretrace.features import Precision
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes
 from foretrace.imagined.domain import Ranges, find_unusual
@@ -202,7 +202,7 @@ class EffectPredictor(Imaginer, nn.Module):
     @property
     def needs_effect(self) -> str | None:
         """Features that are observed during the action."""
-        return f"features {self.features.label!r}" if self.features.oracle else None
+        return f"features {shown(self.features.label)}" if self.features.oracle else None
 
     @final
     @property
@@ -260,7 +260,7 @@ class EffectPredictor(Imaginer, nn.Module):
             return np.zeros(len(batch), dtype=np.int64)
         if odd := sorted(set(batch.outcome.tolist()) - set(self.outcomes)):
             raise TrainingError(
-                f"an interaction has the outcome {odd[0]!r}, and the predictor distinguishes "
+                f"an interaction has the outcome {shown(odd[0])}, and the predictor distinguishes "
                 f"{', '.join(self.outcomes)}: name it among the outcomes or leave the interaction out"
             )
         return np.array([self.outcomes.index(name) for name in batch.outcome.tolist()], dtype=np.int64)
@@ -321,7 +321,7 @@ class EffectPredictor(Imaginer, nn.Module):
             first = self.features(parts[0].to(self.device))
             if first.shape != (len(parts[0]), self.features.num_features):
                 raise TrainingError(
-                    f"features {self.features.label!r} have the shape {tuple(first.shape)} for {len(parts[0])} "
+                    f"features {shown(self.features.label)} have the shape {tuple(first.shape)} for {len(parts[0])} "
                     f"interactions: num_features is {self.features.num_features}"
                 )
             if in_place and (first.shape, first.dtype) == (parts[0].shape, inputs.dtype):

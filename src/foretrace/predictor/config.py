@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
-from foretrace.errors import TrainingError, check_type, shown
+from foretrace.errors import TrainingError, check_type, fault, shown, wrong_type
 from foretrace.features import FEATURES, FeatureExtractor, Option, make_features
 from foretrace.imagined.context import check_names
 from foretrace.interactions.record import Outcome
@@ -25,8 +25,9 @@ def check_count(name: str, value: Any, most: int, least: int = 1) -> None:
     Raises:
         TrainingError: Naming the setting, its value and the limits.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise TrainingError(f"{name} is {value!r}: give a number from {least} to {most}")
+    is_int = isinstance(value, int) and not isinstance(value, bool)
+    if not is_int or not least <= value <= most:
+        raise fault(TrainingError, is_int)(f"{name} is {shown(value)}: give a number from {least} to {most}")
 
 
 def check_choice(name: str, value: Any, choices: Any) -> None:
@@ -35,8 +36,11 @@ def check_choice(name: str, value: Any, choices: Any) -> None:
     Raises:
         TrainingError: Naming the setting, its value and the choices.
     """
-    if not isinstance(value, str | int) or value not in tuple(choices):
-        raise TrainingError(f"{name} is {shown(value)}: choose from {', '.join(map(str, choices))}")
+    plain = isinstance(value, str | int | float)
+    if not plain or value not in tuple(choices):
+        raise fault(TrainingError, plain)(
+            f"{name} is {shown(value)}: choose from {', '.join(map(str, choices))}"
+        )
 
 
 def check_outcomes(outcomes: Any) -> None:
@@ -45,13 +49,16 @@ def check_outcomes(outcomes: Any) -> None:
     Raises:
         TrainingError: There is none, or one is unknown.
     """
-    if not outcomes or not isinstance(outcomes, tuple | list):
-        raise TrainingError(f"outcomes is {outcomes!r}: name at least one, of {', '.join(Outcome)}")
+    several = isinstance(outcomes, tuple | list)
+    if not several or not outcomes:
+        raise fault(TrainingError, several)(
+            f"outcomes is {shown(outcomes)}: name at least one, of {', '.join(Outcome)}"
+        )
     for name in outcomes:
         if name not in list(Outcome):
-            raise TrainingError(f"unknown outcome {name!r}; choose from {', '.join(Outcome)}")
+            raise TrainingError(f"unknown outcome {shown(name)}; choose from {', '.join(Outcome)}")
         if list(outcomes).count(name) > 1:
-            raise TrainingError(f"outcome {name!r} is named twice: name it once")
+            raise TrainingError(f"outcome {shown(name)} is named twice: name it once")
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -61,7 +68,7 @@ def check_flag(name: str, value: Any) -> None:
         TrainingError: Naming the setting and its value.
     """
     if not isinstance(value, bool):
-        raise TrainingError(f"{name} is {value!r}: give True or False")
+        raise wrong_type(TrainingError)(f"{name} is {shown(value)}: give True or False")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,12 +104,12 @@ class TrainConfig:
             check_count("threads", self.threads, 1024)
         rate = self.learning_rate
         if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < math.inf:
-            raise TrainingError(f"learning_rate is {rate!r}: give a finite number above 0")
+            raise TrainingError(f"learning_rate is {shown(rate)}: give a finite number above 0")
         if self.outcomes is not None:
             check_outcomes(self.outcomes)
         if self.split is not None:
             if not isinstance(self.split, tuple | list) or len(self.split) != 3:
-                raise TrainingError(f"split is {self.split!r}: give the sizes of three parts")
+                raise TrainingError(f"split is {shown(self.split)}: give the sizes of three parts")
             for size in self.split:
                 check_count("a part of the split", size, 1_000_000_000)
         check_count("seed", self.seed, 2**63 - 1, least=0)
@@ -132,7 +139,7 @@ class PredictorConfig:
 
     def __post_init__(self) -> None:
         if not isinstance(self.context, tuple | list):
-            raise TrainingError(f"context is {self.context!r}: give the names in a tuple")
+            raise TrainingError(f"context is {shown(self.context)}: give the names in a tuple")
         object.__setattr__(self, "context", tuple(self.context))
         check_type("feature_options", self.feature_options, dict, TrainingError)
         check_names(self.context)

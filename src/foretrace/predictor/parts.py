@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, shown
 from foretrace.imagined.context import recorded_context
 from foretrace.imagined.domain import measure
 from foretrace.interactions.dataset import Dataset, InteractionBatch
@@ -136,7 +136,7 @@ def check_split(split: Split, lengths: np.ndarray) -> None:
     """Refuse rows that the data do not have, and parts from which nothing can be learned."""
     for name, rows in asdict(split).items():
         if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "iu" or rows.ndim != 1:
-            raise TrainingError(f"{name} part of the split is {rows!r}: give an array of row numbers")
+            raise TrainingError(f"{name} part of the split is {shown(rows)}: give an array of row numbers")
         if len(rows) and not (rows.min() >= 0 and rows.max() < len(lengths)):
             worst = rows.min() if rows.min() < 0 else rows.max()
             raise TrainingError(

@@ -159,8 +159,8 @@ class RunFolder:
         if difference := first_difference(there, config):
             name, found, wanted = difference
             raise TrainingError(
-                f"{self.path} holds a training with {name} = {found!r}, not {wanted!r}: choose another folder, the "
-                "same configuration, or start afresh"
+                f"{self.path} holds a training with {name} = {shown(found)}, not {shown(wanted)}: choose another "
+                "folder, the same configuration, or start afresh"
             )
 
     @property
@@ -314,7 +314,7 @@ def _rows_of(run: str | Path, data: Source, part: str) -> Source:
     """The interactions that were one part of a training's split, and are still the same."""
     parts, prints = _read_split(run)
     if part not in parts or part not in prints:
-        raise TrainingError(f"{Path(run) / SPLIT} has no part {part!r}; it has: {', '.join(parts)}")
+        raise TrainingError(f"{Path(run) / SPLIT} has no part {shown(part)}; it has: {', '.join(parts)}")
     rows = np.flatnonzero(np.isin(data.ids, parts[part]))
     _ = data.times  # those of the whole from here on, even if the part's longest trajectory is shorter
     if len(rows) != len(parts[part]):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from foretrace.errors import TrainingError, check_type
+from foretrace.errors import TrainingError, check_type, shown
 from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
 from foretrace.files import as_path, short_hash
@@ -212,7 +212,7 @@ class _Training:
         groups = parameter_groups(predictor)
         if not groups:
             raise TrainingError(
-                f"predictor {predictor.label!r} has no parameters to train: create them in __init__"
+                f"predictor {shown(predictor.label)} has no parameters to train: create them in __init__"
             )
         self.optimizer = torch.optim.AdamW(groups, eps=1e-12, fused=True)
 

@@ -5,7 +5,7 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from foretrace.errors import RobotError
+from foretrace.errors import RobotError, shown
 
 DASHBOARD_PORT = 29999
 PATIENCE = 2.0
@@ -28,11 +28,11 @@ def check_host(host: str) -> None:
     """
     if isinstance(host, str) and re.fullmatch(r"[^:]+:\d+", host):
         raise RobotError(
-            f"host {host[:80]!r} has a port: leave it out, a controller's ports are always the same"
+            f"host {shown(host[:80])} has a port: leave it out, a controller's ports are always the same"
         )
     if not isinstance(host, str) or not (NAME.fullmatch(host) or ADDRESS_6.fullmatch(host)):
         raise RobotError(
-            f"host {str(host)[:80]!r} is no name or address of a controller: give one such as 192.168.1.10"
+            f"host {shown(str(host)[:80])} is no name or address of a controller: give one such as 192.168.1.10"
         )
 
 
@@ -63,7 +63,7 @@ def dashboard(host: str, patience: float = PATIENCE) -> Iterator[Callable[[str],
             return answer()
 
         if "Dashboard" not in (greeting := answer()):
-            raise OSError(f"it greets with {greeting[:40]!r}")
+            raise OSError(f"it greets with {shown(greeting[:40])}")
         yield ask
 
 
@@ -88,7 +88,8 @@ def refuse_other_model(host: str, is_ur10: bool = False) -> None:
     number = re.search(r"\b(\d+)\.\d+(?:\.\d+)*", version)
     if number is None:
         raise RobotError(
-            f"{host} does not say its version, but {version[:80]!r}: only a UR10 (CB3) with PolyScope {SERIES} is moved"
+            f"{host} does not say its version, but {shown(version)}: only a UR10 (CB3) with PolyScope "
+            f"{SERIES} is moved"
         )
     named = re.fullmatch(r"UR\d+\w*", model, re.IGNORECASE)
     series = int(number[1])
@@ -96,8 +97,8 @@ def refuse_other_model(host: str, is_ur10: bool = False) -> None:
         return
     if series == SERIES and named is None:
         raise RobotError(
-            f"{host} (PolyScope {number[0]}) does not say its model, but {model[:80]!r}, as before PolyScope 3.12: "
-            "give --is-ur10 if its arm is a UR10 (CB3)"
+            f"{host} (PolyScope {number[0]}) does not say its model, but {shown(model)}, as before "
+            "PolyScope 3.12: give --is-ur10 if its arm is a UR10 (CB3)"
         )
     if series != SERIES or model.upper() != MODEL:
         e_series = series == E_SERIES and model.upper() in ("UR3", "UR5", "UR10", "UR16")

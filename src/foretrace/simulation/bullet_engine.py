@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Motion, Tool, tool_transforms
-from foretrace.errors import SimulationError
+from foretrace.errors import SimulationError, shown
 from foretrace.geometry import matrix_to_pose, pose_to_matrix
 from foretrace.interactions.motions import GRAVITY, ContactParameters
 from foretrace.interactions.record import Physics
@@ -67,7 +67,7 @@ class BulletEngine(Engine):
     ) -> None:
         if embodiment != "tool":
             raise SimulationError(
-                f"engine 'bullet' has no embodiment {embodiment!r}: "
+                f"engine 'bullet' has no embodiment {shown(embodiment)}: "
                 "choose embodiment tool (--embodiment tool), or engine mujoco for the arm"
             )
         check_divides(timestep, sample_period)

@@ -19,7 +19,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from foretrace.actions import Action, LeverUp, Screwdriver, ToolPath
-from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type, is_whole
+from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type, is_whole, shown
 from foretrace.files import (
     as_json,
     as_path,
@@ -82,7 +82,7 @@ class CollectConfig:
         ):
             value = getattr(self, name)
             if not is_whole(value, least, most):
-                raise SimulationError(f"{name} is {value!r}: give a whole number from {least} to {most}")
+                raise SimulationError(f"{name} is {shown(value)}: give a whole number from {least} to {most}")
         kinds = {"simulation": SimulationConfig, "path": ToolPath, "randomisation": Randomisation}
         for name, kind in (kinds | {"recipe": str, "tool": Screwdriver}).items():
             check_type(name, getattr(self, name), kind, SimulationError)

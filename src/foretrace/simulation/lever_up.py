@@ -7,7 +7,15 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import FAILED, Action, Motion, ToolPath
-from foretrace.errors import ActionError, SimulationError, check_ranges, check_type, is_number, is_whole
+from foretrace.errors import (
+    ActionError,
+    SimulationError,
+    check_ranges,
+    check_type,
+    is_number,
+    is_whole,
+    shown,
+)
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -64,7 +72,7 @@ class SimulationConfig:
         numbers = {name: getattr(self, name) for name in ("timestep", "sample_period", "watch_time")}
         for name, value in (numbers | asdict(self.physics)).items():
             if not is_number(value) and not (name == "table_edge" and value is None):
-                raise SimulationError(f"{name} is {value!r}: give a number")
+                raise SimulationError(f"{name} is {shown(value)}: give a number")
         if not SHORTEST <= self.timestep <= self.sample_period <= LONGEST:
             raise SimulationError(
                 f"timestep = {self.timestep} s and sample_period = {self.sample_period} s: give at least {SHORTEST} s, "
@@ -79,7 +87,9 @@ class SimulationConfig:
             raise SimulationError(f"table_edge = {self.physics.table_edge} m: give a distance up to 10 m")
         make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
         if self.camera not in CAMERAS:
-            raise SimulationError(f"camera {self.camera!r} is unknown: choose one of {', '.join(CAMERAS)}")
+            raise SimulationError(
+                f"camera {shown(self.camera)} is unknown: choose one of {', '.join(CAMERAS)}"
+            )
 
 
 def simulate_lever_up(
@@ -116,7 +126,7 @@ def simulate_lever_up(
     check_type("config", config, SimulationConfig, SimulationError)
     check_type("execution_error", execution_error, ExecutionOffset, SimulationError)
     if not is_whole(seed, 0, LARGEST_SEED):
-        raise SimulationError(f"seed is {seed!r}: give a whole number from 0 to {LARGEST_SEED}")
+        raise SimulationError(f"seed is {shown(seed)}: give a whole number from 0 to {LARGEST_SEED}")
     action.check_contact(obj)
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":

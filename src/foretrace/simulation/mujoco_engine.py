@@ -14,7 +14,7 @@ from jaxtyping import Float
 from mujoco import rollout
 
 from foretrace.actions import Motion, Tool, tool_transforms
-from foretrace.errors import SimulationError
+from foretrace.errors import SimulationError, shown
 from foretrace.geometry import matrix_to_pose, planar_transform
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel
@@ -67,7 +67,7 @@ class MujocoEngine(Engine):
     def __init__(self, embodiment: str = "arm", timestep: float = 0.002, sample_period: float = 0.05) -> None:
         if embodiment not in EMBODIMENTS:
             raise SimulationError(
-                f"embodiment {embodiment!r} is unknown: choose one of {', '.join(EMBODIMENTS)}"
+                f"embodiment {shown(embodiment)} is unknown: choose one of {', '.join(EMBODIMENTS)}"
             )
         check_divides(timestep, sample_period, arm.CONTROL_PERIOD)
         self.embodiment, self.timestep, self.sample_period = embodiment, timestep, sample_period

@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float, UInt8
 
 from foretrace.actions import LeverUp, Motion
-from foretrace.errors import SimulationError, check_ranges, check_type
+from foretrace.errors import SimulationError, check_ranges, check_type, shown
 from foretrace.files import write_json
 from foretrace.geometry import (
     invert_transform,
@@ -108,7 +108,7 @@ class RecordingConfig:
         check_type("camera", self.camera, PinholeCamera, SimulationError)
         check_type("faults", self.faults, Faults, SimulationError)
         if self.simulation.engine != "mujoco":
-            raise SimulationError(f"engine {self.simulation.engine!r} cannot record: take mujoco")
+            raise SimulationError(f"engine {shown(self.simulation.engine)} cannot record: take mujoco")
         check_ranges(SimulationError, "film", self.camera, WIDTH_RANGE, WITHIN)
         check_ranges(SimulationError, "film", self, RANGES, WITHIN)
 
