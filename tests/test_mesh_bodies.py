@@ -53,6 +53,10 @@ ONE_BODY = {
     "cavity": (together(CUBE, box((0.04, 0.04, 0.04), inwards=True)), 0.001 - 0.04**3),
     "inside out": (together(box((0.1, 0.1, 0.1), inwards=True), box((0.04, 0.04, 0.04))), 0.001 - 0.04**3),
     "one inside out": (together(CUBE, box(SMALL, (0.07, 0, 0), inwards=True)), 0.001 + 0.07 * 0.04**2),
+    "one of two alike inside out": (
+        together(CUBE, box((0.1, 0.1, 0.1), (0.07, 0, 0), inwards=True)),
+        0.0017,
+    ),
     "piercing a cavity": (
         together(CUBE, box((0.06, 0.06, 0.06), inwards=True), box((0.02, 0.02, 0.1))),
         0.001 - 0.06**3 + 0.06 * 0.02**2,

@@ -105,6 +105,10 @@ BAD_FILES = {
     "-short.stl": (stl.export_stl(BOX)[:-60], r"holds no triangles|cannot be read"),
     "-nan.obj": (obj_text(BOX).replace("-60.0", "nan", 1).encode(), r"1 of its vertices are not finite"),
     "-far.obj": (obj_text(BOX).replace("-60.0", "1e30", 1).encode(), r"reaches 1e\+30 units"),
+    "-plane.stl": (
+        stl.export_stl(trimesh.Trimesh(0.013 * BOX.vertices, BOX.faces[:1])),
+        r"not watertight",
+    ),
     "-flat.stl": (
         stl.export_stl(trimesh.Trimesh(BOX.vertices * [1, 1, 0], BOX.faces)),
         r"encloses no volume",

@@ -43,18 +43,20 @@ def one_solid(vertices: Points, faces: Faces) -> tuple[Points, Faces]:
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     plain = mesh.is_watertight and mesh.is_winding_consistent
-    if plain and abs(mesh.volume) < 1e-9 * np.ptp(vertices, axis=0).max() ** 3:
-        raise ShapeError(NO_VOLUME)
-    if plain and is_convex_body(mesh):
+    with np.errstate(divide="ignore", invalid="ignore"):  # the middle of no volume
+        nothing = abs(mesh.volume) < 1e-9 * np.ptp(vertices, axis=0).max() ** 3
+    if plain and not nothing and is_convex_body(mesh):
         return vertices, faces if mesh.volume > 0 else faces[:, ::-1]
     solid = as_solid(vertices, faces)
     if solid.is_empty() or (not plain and solid.status().name != "NoError"):
         trimesh.repair.fix_winding(mesh)
         faces = np.array(mesh.faces)
         solid = as_solid(vertices, faces)
+    shells = solid.decompose()
+    if plain and nothing and len(shells) < 2:  # of two alike, one may be inside out
+        raise ShapeError(NO_VOLUME)
     if solid.is_empty():
         raise ShapeError(_open_edges(faces))
-    shells = solid.decompose()
     if plain and len(shells) == 1:
         faces = faces if mesh.volume > 0 else faces[:, ::-1]
     else:
@@ -112,6 +114,8 @@ def _united(vertices: Points, faces: Faces, shells: list[Any]) -> tuple[Points, 
     solid = Manifold.batch_boolean(bodies, OpType.Add)
     parts = _separate(solid)
     volume = solid.volume()
+    if volume < 1e-9 * whole:
+        raise ShapeError(NO_VOLUME)
     large = [part for part in parts if part.volume() > DEBRIS * volume]
     if len(large) > 1:
         _one_body(large)

@@ -1,5 +1,6 @@
 """Triangle meshes from files, their unit and their precision."""
 
+import logging
 import warnings
 from pathlib import Path
 
@@ -41,6 +42,10 @@ POINTED_OUT = (0.02, 0.4)
 """Smaller and larger objects are unusual, and pointed out [m]."""
 COARSEST = 2e-3
 """Largest rounding of coordinates, relative to the mesh's smallest extent."""
+
+logging.getLogger("trimesh").addHandler(
+    logging.NullHandler()
+)  # a texture that is missing is printed, otherwise
 
 
 def is_mesh_file(path: Path) -> bool:
@@ -184,7 +189,7 @@ def check_precision(vertices: Points) -> None:
     smallest = float(np.ptp(vertices, axis=0).min())
     rounded = np.array_equal(vertices, vertices.astype(np.float32))
     # Whole numbers below 2^24 are exact in single precision.
-    if rounded and step > COARSEST * smallest and (step >= 1 or (vertices % 1 != 0).any()):
+    if rounded and step > COARSEST * smallest > 0 and (step >= 1 or (vertices % 1 != 0).any()):
         raise ShapeError(
             f"mesh lies {far:.3g} units from the origin, where its coordinates are rounded to {step:.2g}, and is "
             f"{smallest:.3g} units thick: export it nearer to the origin"
