@@ -41,6 +41,7 @@ def info(topic: str = "/cam/camera_info", frame: str = "cam", **changed: Any) ->
         ("Kannala Brandt4", 4),
         ("", 0),
         ("none", 0),
+        ("Inverse Brown Conrady", 0),
     ],
 )
 def test_points_are_where_the_model_puts_them(model: str, count: int) -> None:
@@ -74,6 +75,7 @@ def test_zeros_at_the_end_change_nothing() -> None:
         ({"width": 0, "height": 0}, "not calibrated .all zeros, 0 x 0"),
         ({"k": [np.nan, *K[1:]]}, "fx = nan"),
         ({"k": [-500.0, *K[1:]]}, "fx = -500.0, it must be positive"),
+        ({"k": [1.0, 0, 0, 0, 1, 0, 0, 0, 1]}, "not calibrated .focal length of 1 pixels"),
         ({"k": [500.0, 3.0, *K[2:]]}, "skew is 3 pixels"),
         ({"d": LENS[:3]}, r"plumb_bob with coefficients \[-0.3, 0.1, 0.001\]: it has 4 or 5 or 8"),
         ({"d": LENS[:8], "distortion_model": "radtan"}, "it has 4 or 5 finite ones"),
@@ -152,6 +154,12 @@ def test_the_camera_info_beside_the_images_counts(
 ) -> None:
     infos = sorted([info(right, frame), *(info(other, frame, k=OTHER) for other in others)])
     assert camera_of(Images(topic, frame, (640, 480)), infos).fx == 500
+
+
+def test_a_slash_before_a_frame_says_nothing() -> None:
+    images = Images("/cam/image_raw", "/cam", (640, 480))
+    for topic in ("/cam/camera_info", "/elsewhere/camera_info"):
+        assert camera_of(images, [info(topic, "cam")]) == camera_of(IMAGES, [info(topic, "/cam")])
 
 
 def test_elsewhere_the_frame_must_be_the_same() -> None:

@@ -46,6 +46,8 @@ READ = {
     "quotes": rows("'{}' \"{}\""),
     "headings": "x,y\n" + rows("{},{}"),
     "headings with blanks": "x [m]  y [m]\n" + rows("{} {}"),
+    "headings of blanks": "x y\n" + rows("{} {}").replace(".", ",") + "\n0,11 0",
+    "headings of blanks, commas": "x y\n" + rows("{},{}"),
     "a title and headings": "Outline of a box\n\nX;Y;Z\n" + rows("{};{};0.5"),
     "headings in another order": "id\ty\tx\n" + rows("{2}\t{1}\t{0}").replace("0\t0.0\t", "a0\t0.0\t", 1),
     "an index": ",x,y\n" + rows("{2},{0},{1}"),
@@ -81,6 +83,8 @@ REFUSED = {
     "line 3: '-0.06' has 1 entries": rows("{} {}").replace("-0.06 0.05", "-0.06"),
     "line 1: '1 2 3 4 5' has 5 entries": "1 2 3 4 5\n6 7 8 9 10",
     "line 1: '0,05,0,02' has 4 entries: columns parted by \";\"": "0,05,0,02\n0,01,0,05\n0,1,0,2",
+    "line 2: '9,0,0,0' has 4 entries: columns parted by \";\"": "x,y\n9,0,0,0\n2,0,8,0\n-7,0,5,0\n",
+    "polygon with 1 corners": "1 2",
     "line 2, column 3: z is not 3 as above": "1 2 3\n4 5 6\n7 8 3",
     "170 across, which looks like millimetres: give --scale 0.001": rows("{} {}", unit=0.001),
     "17 across, which looks like centimetres: give --scale 0.01": rows("{} {}", unit=0.01),
@@ -114,7 +118,7 @@ def test_what_cannot_be_read_is_named(message, tmp_path):
     file = tmp_path / "outline.txt"
     file.write_text(REFUSED[message], encoding="utf-8")
     with pytest.raises(ShapeError) as caught:
-        read_polygon(file)
+        Prism(read_polygon(file))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300

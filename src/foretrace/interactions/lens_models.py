@@ -9,7 +9,8 @@ from foretrace.errors import PerceptionError, shown
 OPENCV = ("plumb_bob", "rational_polynomial")
 BROWN = ("radtan", "brown_conrady")
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
-STRAIGHT = ("", "none")
+STRAIGHT = ("", "none", "inverse_brown_conrady", "modified_brown_conrady")
+"""Models without distortion, and those of RealSense of which no other coefficients than zeros can be used."""
 SIZES = (
     dict.fromkeys(OPENCV, (4, 5, 8, 12, 14))
     | dict.fromkeys(BROWN, (4, 5))

@@ -64,7 +64,7 @@ def read_polygon(file: Path, scale: float | None = None) -> Float[np.ndarray, "n
     if scale is not None and not (math.isfinite(scale) and scale > 0):
         raise ShapeError(f"scale of {shown(scale)} metres per unit: give a positive number")
     corners = corners * (scale or unit or 1.0)
-    if scale is None and unit is None:
+    if scale is None and unit is None and len(corners) > 2:
         _check_unit(file, corners, mapped)
     return corners
 
@@ -167,7 +167,7 @@ def _read(
     rows: Sequence[Row], head: Sequence[str], delimiter: str | None, decimal: str
 ) -> tuple[tuple[int, bool], Float[np.ndarray, "n 2"] | str]:
     """A table read in one way: how far that leads, and the corners or the first fault."""
-    columns = _named_columns(head, delimiter)
+    columns, most = _named_columns(head, delimiter)
     found, fault, width = [], "", 0
     for row in rows:
         place = f"line {row.line}"
@@ -175,7 +175,8 @@ def _read(
         width = width or len(cells)
         chosen = columns or range(len(cells))
         values = [_number(cells[k], decimal) if k < len(cells) else None for k in chosen]
-        if not columns and (len(cells) not in (2, 3) or len(cells) != width):
+        odd = len(cells) > most if columns else len(cells) not in (2, 3) or len(cells) != width
+        if odd:
             wanted = 'columns parted by ";" where numbers have decimal commas'
             parted = delimiter == "," and "." not in row.text
             fault = fault or (
@@ -200,16 +201,17 @@ def _read(
     return far, corners[:, :2]
 
 
-def _named_columns(head: Sequence[str], delimiter: str | None) -> list[int]:
-    """Columns x, y and perhaps z by the headings; nothing if these do not name them."""
+def _named_columns(head: Sequence[str], delimiter: str | None) -> tuple[list[int], int]:
+    """Columns x, y and perhaps z by the headings, and how many there are; nothing if these do not name them."""
     for line in reversed(head):
         cells = [[word.lower() for word in WORD.findall(cell)] for cell in _split(line, delimiter)]
         if delimiter is None:  # a unit in brackets is no column
             cells = [cell for cell in cells if not cell or not UNITS.keys() >= set(cell)]
         named = [[k for k, cell in enumerate(cells) if axis in cell] for axis in "xyz"]
-        if [len(each) for each in named[:2]] == [1, 1] and len(named[2]) < 2:
-            return [k for each in named for k in each]
-    return []
+        columns = [k for each in named for k in each]
+        if [len(each) for each in named[:2]] == [1, 1] and len(set(columns)) == len(columns) < 4:
+            return columns, len(cells)
+    return [], 0
 
 
 def _split(line: str, delimiter: str | None) -> list[str]:

@@ -16,6 +16,8 @@ RECTIFIED = re.compile(r"(^|_)(rect|rectified|undist|undistorted)(_|$)")
 """In a part of the topic of images without distortion."""
 SIDES = ({"left"}, {"right"})
 MOST_SHOWN = 4
+SHORTEST = 0.05
+"""Shortest focal length of a camera [width]: drivers without a calibration write a matrix of ones, too."""
 
 
 class Info(NamedTuple):
@@ -29,7 +31,7 @@ class Info(NamedTuple):
     @property
     def frame(self) -> str:
         """Name of the frame of its camera."""
-        return self.message.header.frame_id
+        return _frame(self.message.header.frame_id)
 
 
 class Images(NamedTuple):
@@ -55,6 +57,7 @@ def camera_of(images: Images, infos: Sequence[Info]) -> PinholeCamera:
     """
     if not infos:
         raise PerceptionError("there is no camera_info")
+    images = images._replace(frame=_frame(images.frame))
     chosen = _own(images, infos)
     cameras: list[PinholeCamera] = []
     for info in chosen:
@@ -106,6 +109,11 @@ def _other_side(images: Images, info: Info) -> bool:
     return shifted or any(side & ours and other & theirs for side, other in (SIDES, SIDES[::-1]))
 
 
+def _frame(name: str) -> str:
+    """Name of a frame, which ROS 1 also wrote with a slash before it."""
+    return name.removeprefix("/")
+
+
 def _shown(topics: Iterable[str]) -> str:
     names = list(topics)
     more = f" and {len(names) - MOST_SHOWN} more" if len(names) > MOST_SHOWN else ""
@@ -128,6 +136,8 @@ def _read(message: Any, images: Images) -> PinholeCamera:
         raise PerceptionError("it has no matrix P for rectified images")
     if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
         raise PerceptionError(f"its skew is {matrix[0, 1]:g} pixels, which cannot be used")
+    if 0 < matrix[0, 0] < SHORTEST * full[0]:
+        raise PerceptionError(f"it is not calibrated (focal length of {matrix[0, 0]:g} pixels)")
     return PinholeCamera(*images.size, *_on_sensor(message, matrix, full, images.size), *lens)
 
 
