@@ -76,6 +76,17 @@ def test_pictures_taken_twice_do_not_make_it_more_certain(table, good: dict[str,
     assert twice.deviations == pytest.approx(once.deviations, rel=1e-3)
 
 
+def test_a_lens_that_is_uncertain_only_where_no_board_was_is_reported(table, good) -> None:
+    """The middle of a larger image tells nothing of its border."""
+    margin = ((250, 250), (250, 250), (0, 0))
+    larger = {name: np.pad(image, margin[: image.ndim], constant_values=128) for name, image in good.items()}
+    found = calibrate(larger, table.BOARD)
+    assert found.camera.fx == pytest.approx(table.CAMERA.fx, rel=0.01)
+    assert found.deviations["border"] > 0.02 * found.camera.fx > found.deviations["fx"]
+    assert any("uncertain at the image's border: standard deviation" in note for note in found.notes)
+    assert calibrate(good, table.BOARD).notes == ()
+
+
 def test_a_bent_board_is_taken_as_it_is(table) -> None:
     images, board = table.photographs(table.Kind(10, bend=0.003), 1)
     found = calibrate(images, board)

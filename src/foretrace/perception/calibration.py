@@ -24,7 +24,8 @@ ALIKE = 0.005
 LARGEST_ERROR = 1.0
 """Largest reprojection error of a calibration [pixel]."""
 LOOSEST = 0.02
-"""Largest standard deviation of focal length, centre and border of a calibration [focal length]."""
+"""Largest standard deviation of focal length and centre of a calibration, and of a line of sight at the image's border
+that passes without a word [focal length]."""
 FARTHEST_FOCUS = 0.2
 """Largest relative change of a refined focal length."""
 LEAST_TILT, GOOD_TILT = np.deg2rad([10.0, 25.0])
@@ -117,6 +118,11 @@ def calibrate(images: Mapping[str, UInt8[np.ndarray, "rows columns *channels"]],
     squared = [2 * (part**2).mean() for part in np.split(fit.residuals, ends[:-1])]
     errors = dict(zip(points, np.sqrt(squared).tolist(), strict=True))
     notes = _differences(stated, board, bend, [images[name] for name in list(points)[:3]])
+    if deviations["border"] > LOOSEST * camera.fx:
+        notes += (
+            f"the lens is uncertain at the image's border: standard deviation {deviations['border']:.0f} pixels; hold "
+            "the board there, too, or keep the object away from it",
+        )
     return Calibration(camera, fit.error, errors, deviations, left_out, board, notes)
 
 
@@ -124,10 +130,8 @@ def _check_deviations(
     deviations: Mapping[str, float], focus: float, views: BoardViews, tilts: Sequence[float]
 ) -> None:
     """Refuse a calibration that is too uncertain, with what would make it better."""
-    names = {"fx": "the focal length", "cx": "the centre", "border": "the lens at the image's border"}
-    shares = {
-        name: max(deviations[name], deviations.get(name.replace("x", "y"), 0.0)) / focus for name in names
-    }
+    names = {"fx": "the focal length", "cx": "the centre"}
+    shares = {name: max(deviations[name], deviations[name.replace("x", "y")]) / focus for name in names}
     worst = max(shares, key=lambda name: shares[name])
     if shares[worst] <= LOOSEST:
         return
