@@ -333,7 +333,7 @@ def still_pose(
         if len(often) > 1 and upside_down and upside_down[0].error < config.largest_error:
             state = "not where the layout has them"
             remedy = (
-                "they fit if each is turned by 180 degrees, as OpenCV draws AprilTags: "
+                "they fit if each is turned by 180 degrees (OpenCV draws AprilTags so): "
                 'add "angle_deg": 180 to each in the layout'
             )
         raise PerceptionError(f"markers {body.ids} on the table are {state}: {remedy}")
