@@ -288,3 +288,15 @@ def test_an_uncertain_path_is_drawn_as_a_tube() -> None:
     assert (
         draw_overlay(grey, camera, np.eye(4), paths=paths, radii={"predicted": np.full(9, np.nan)}) == bare
     ).all()
+
+
+def test_names_of_paths_have_a_border_that_fits() -> None:
+    camera, grey = PinholeCamera(640, 360, 400.0, 400.0, 319.5, 179.5), np.full((360, 640, 3), 128, np.uint8)
+    path = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])
+    text = draw_overlay(grey, camera, np.eye(4), paths={"predicted": (path, PREDICTED)})[:40].astype(int)
+    white, red = (np.abs(text - colour).max(axis=2) < 60 for colour in (255, PREDICTED))
+    assert white.any()
+    assert red.any()
+    for axis in (0, 1):
+        first, last = (np.flatnonzero(part.any(axis=axis))[[0, -1]] for part in (white, red))
+        assert np.abs(first - last).max() <= 3
