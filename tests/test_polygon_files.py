@@ -87,7 +87,7 @@ REFUSED = {
     "polygon with 1 corners": "1 2",
     "line 2, column 3: z is not 3 as above": "1 2 3\n4 5 6\n7 8 3",
     "170 across, which looks like millimetres: give --scale 0.001": rows("{} {}", unit=0.001),
-    "17 across, which looks like centimetres: give --scale 0.01": rows("{} {}", unit=0.01),
+    "17 across, which looks like centimetres or inches: give --scale 0.01 or 0.0254": rows("{} {}", unit=0.01),
     "units cm and mm": "x_cm y_mm\n" + rows("{} {}"),
     "has a column lat": "lat,lon\n" + rows("{},{}"),
     "they look like degrees": json.dumps(geojson([[8.5 + x * 1e-5, 47 + y * 1e-5] for x, y in RING])),

@@ -27,6 +27,9 @@ WKT = re.compile(r"(SRID=\d+;)?\s*(MULTI|GEOMETRY)?(POLYGON|COLLECTION|LINESTRIN
 MIXED = r"\s*,\s*|\s+"
 """What parts columns where some lines have commas and others blanks."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Units that headings name [m]."""
+OTHER_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
+"""Units that are guessed of corners too large for metres [m]."""
 DEGREES = {"lon", "lat", "lng", "long", "longitude", "latitude"}
 NOT_DEGREES = "project them to metres, or move the origin to the object"
 FAR = 10.0
@@ -79,12 +82,11 @@ def _check_unit(file: Path, corners: Float[np.ndarray, "n 2"], mapped: bool) -> 
             f"{across}, {away:.4g} from the origin: they look like degrees of longitude and latitude: {NOT_DEGREES}"
         )
     if size > SIZE_LIMITS[1]:
-        likely = {"millimetres": 0.001, "centimetres": 0.01}
-        likely = {name: s for name, s in likely.items() if PLAUSIBLE[0] <= size * s <= PLAUSIBLE[1]}
+        likely = {name: s for name, s in OTHER_UNITS.items() if PLAUSIBLE[0] <= size * s <= PLAUSIBLE[1]}
         if likely:
-            scales = " or ".join(f"--scale {value:g}" for value in likely.values())
+            scales = " or ".join(f"{value:g}" for value in likely.values())
             raise ShapeError(
-                f"{across}, which looks like {' or '.join(likely)}: give {scales}, or write metres"
+                f"{across}, which looks like {' or '.join(likely)}: give --scale {scales}, or write metres"
             )
 
 
