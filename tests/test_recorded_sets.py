@@ -11,6 +11,7 @@ from foretrace.cli import main
 from foretrace.errors import DatasetError
 from foretrace.experiments.transfer import levered_edge
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.description import describe_dataset
 from foretrace.interactions.recorded import NOTES_FOLDER, add_recorded, read_notes
 from foretrace.perception.recordings import open_recording
 from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, train_predictor
@@ -51,6 +52,8 @@ def test_films_of_a_data_set_come_back_as_they_were(simulated: Path, recorded: P
     data, found = Dataset.open(simulated), Dataset.open(recorded)
     levered = np.flatnonzero(data.batch().outcome == "levered")[[2, -1]]
     assert len(found) == 3
+    assert not {"two_support_corners", "rule_agreement"} & describe_dataset(found).keys()
+    assert {"two_support_corners", "rule_agreement"} <= describe_dataset(data).keys()
     for row, at in ((0, 0), (1, 0), (2, 1)):
         truth, effect = data[int(levered[at])].effect, found[row].effect
         assert effect.outcome == "levered"

@@ -28,7 +28,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         ``median_final_rise_cm`` of the centre of mass, ``median_slide_mm`` of the centre of mass along the table before
         the lift, ``largest_path_error_mm`` of the blade, ``two_support_corners`` (share of lever-ups with exactly two
         observed support corners) and ``rule_agreement`` (share of those whose corners the closed-form rule of
-        ``geometry.support_edge`` names).
+        ``geometry.support_edge`` names); the last two are left out where no corners were observed.
     """
     outcome = dataset.index["outcome"].to_numpy()
     rows = [_describe(interaction) for interaction in dataset[outcome == Outcome.LEVERED]]
@@ -46,15 +46,18 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         figures["median_rolled_cm"] = float(CM * np.median(distances))
     if not rows:
         return figures
-    angle, rise, slide, error, two, right = np.array(rows).T
-    return figures | {
+    angle, rise, slide, error, observed, right = np.array(rows).T
+    figures |= {
         "median_final_tilt_deg": float(np.median(angle)),
         "median_final_rise_cm": float(np.median(rise)),
         "median_slide_mm": float(np.median(slide)),
         "largest_path_error_mm": float(error.max()),
-        "two_support_corners": float(two.mean()),
-        "rule_agreement": float(right[two > 0].mean()) if two.any() else float("nan"),
     }
+    if observed.any():  # recordings show none
+        figures["two_support_corners"] = float((observed == 2).mean())
+    if (observed == 2).any():
+        figures["rule_agreement"] = float(right[observed == 2].mean())
+    return figures
 
 
 def _ranges(dataset: Dataset, shapes: list[tuple[str, float | None, Any]]) -> dict[str, tuple[float, float]]:
@@ -70,7 +73,7 @@ def _ranges(dataset: Dataset, shapes: list[tuple[str, float | None, Any]]) -> di
     }
 
 
-def _describe(interaction: Interaction) -> tuple[float, float, float, float, bool, bool]:
+def _describe(interaction: Interaction) -> tuple[float, float, float, float, int, bool]:
     effect, obj = interaction.effect, interaction.object
     com = effect.com_trajectory
     angle = tilt(quaternion_to_matrix(effect.pose_trajectory[:, 3:]))
@@ -88,6 +91,6 @@ def _describe(interaction: Interaction) -> tuple[float, float, float, float, boo
         float(CM * (com[-1, 2] - com[0, 2])),
         float(MM * slide),
         float(MM * effect.path_error),
-        len(observed) == 2,
+        len(observed),
         observed == named,
     )
