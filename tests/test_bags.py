@@ -146,6 +146,17 @@ def test_colour_images_and_camera(tmp_path: Path, ros1: bool) -> None:
     assert all(frame.depth is None for frame in frames)
 
 
+@BOTH
+def test_files_lie_beside_a_bag_or_in_its_folder(tmp_path: Path, ros1: bool) -> None:
+    film = open_recording(bag_of(tmp_path, images(2), ros1))
+    assert film.beside("markers.json") is None
+    (tmp_path / "markers.json").write_text("{}")
+    assert film.beside("markers.json") == tmp_path / "markers.json"
+    if film.path.is_dir():
+        (film.path / "markers.json").write_text("{}")
+        assert film.beside("markers.json") == film.path / "markers.json"
+
+
 @pytest.mark.parametrize("encoding", ["rgb8", "bgra8", "rgba8", "mono8"])
 def test_colours_of_every_encoding(tmp_path: Path, encoding: str) -> None:
     image = np.asarray(images(1)[0].data)

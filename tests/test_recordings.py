@@ -186,6 +186,14 @@ def test_time_stamps_in_another_unit_and_slow_films(
         look(folder)
 
 
+def test_a_single_frame_is_no_recording(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
+    folder = some_of(recorded[0], tmp_path / "some", frames=1)
+    with pytest.raises(
+        PerceptionError, match="some has a single frame: give the recording of a whole lever-up"
+    ):
+        look(folder)
+
+
 def test_one_frame_at_rest_is_not_enough(recorded: tuple[Path, RecordingTruth], tmp_path: Path) -> None:
     folder = some_of(recorded[0], tmp_path / "some", frames=8)
     for number in (1, 2):

@@ -200,6 +200,8 @@ def _detect_all(
         if hopeless is None and not (table | thing) & set(seen.ids.tolist()):
             hopeless = frame.image
     check_times(np.array(times), f" of {recording.path}")
+    if len(times) < 2:
+        raise PerceptionError(f"{recording.path} has a single frame: give the recording of a whole lever-up")
     _check_rate(np.array(times), recording)
     for name, ids in (("object", thing), ("table", table)):
         count = sum(bool(ids & set(seen.ids.tolist())) for seen in detections)
@@ -213,7 +215,7 @@ def _detect_all(
 
 def _check_rate(times: Float[np.ndarray, " frame"], recording: Recording) -> None:
     """Refuse too few frames per second, and time stamps in another unit than seconds."""
-    step = float(np.median(np.diff(times))) if len(times) > 1 else REST_TIME
+    step = float(np.median(np.diff(times)))
     if not SHORTEST_STEP <= step <= REST_TIME + 1e-6:
         raise PerceptionError(
             f"{recording.path} has {1 / step:.3g} frames per second by its time stamps, from {times[0]:.10g} to "

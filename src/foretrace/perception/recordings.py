@@ -43,8 +43,10 @@ class Recording:
 
     def beside(self, name: str) -> Path | None:
         """A file that belongs to the recording, if it is there."""
-        folder = self.path if self.path.is_dir() else self.path.parent
-        return folder / name if (folder / name).is_file() else None
+        folders = [self.path] if self.path.is_dir() else []
+        if not (self.path / recording_folder.TIMES).is_file():  # a file, or a bag that is a folder
+            folders.append(self.path.parent)
+        return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
     def background(self) -> UInt8[np.ndarray, "rows columns 3"] | None:
         """The table before the object was put there, if the recording has it."""
