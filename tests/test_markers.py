@@ -247,7 +247,8 @@ def test_markers_of_a_layout_are_printed_each_with_its_side(tmp_path: Path) -> N
     [
         (["tags.jpg"], "ends in .pdf, .svg, .png"),
         (["tags.pdf", "--ids", "587"], "marker 587 is not in apriltag_36h11: choose 0 to 586"),
-        (["tags.pdf", "--side", "50"], "0.005 to 0.6 m"),
+        (["tags.pdf", "--side", "50"], "marker 0 has a side of 50.0 m: give 0.005 to 0.6 m"),
+        (["tags.pdf", "--ids"], "no markers to print"),
         (["tags.pdf", "--family", "apriltag"], "'apriltag' is unknown: choose one of"),
         (["tags.png", "--side", "0.14"], "5 markers fill 5 pages: write them to a .pdf"),
     ],

@@ -89,8 +89,8 @@ def _print_markers(out: Path, layout: Path | None, family: str, sides: dict[int,
     pages = print_markers(out, family, sides)
     lengths = ", ".join(f"{1000 * side:.1f}" for side in sorted(set(sides.values())))
     print(
-        f"{out}: {len(sides)} markers of {family} on {pages} page{'s' * (pages > 1)}; print at 100 %, their black "
-        f"squares then measure {lengths} mm"
+        f"{out}: {len(sides)} marker{'s' * (len(sides) > 1)} of {family} on {pages} page{'s' * (pages > 1)}; "
+        f"print at 100 %, their black squares then measure {lengths} mm"
     )
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, shown
 from foretrace.files import atomic_path, make_folder
 from foretrace.interactions.marker_patterns import dictionary, draw_marker
 
@@ -51,8 +51,11 @@ def print_markers(path: str | Path, name: str, sides: Mapping[int, float]) -> in
         raise PerceptionError(
             f"cannot write markers to {path}: choose a name that ends in {', '.join(SUFFIXES)}"
         )
-    if not sides or not all(0.005 <= side <= 0.6 for side in sides.values()):
-        raise PerceptionError(f"markers with sides {dict(sides)}: give at least one, 0.005 to 0.6 m")
+    if not sides:
+        raise PerceptionError("no markers to print: give the number of one at least (--ids)")
+    for id, side in sides.items():
+        if not 0.005 <= side <= 0.6:
+            raise PerceptionError(f"marker {id} has a side of {shown(side)} m: give 0.005 to 0.6 m")
     modules = dictionary(name).markerSize + 2
     cells = {id: 1000 * side * (modules + 2) / modules for id, side in sides.items()}
     largest = max(cells.values())
