@@ -164,6 +164,7 @@ def test_labels_that_do_not_fit_are_refused(
             {"image": None, "polygon": Path("outline.txt"), "invert": True},
             "--label and --invert go with --image",
         ),
+        ({"label": "1", "invert": True}, "--label and --invert given"),
         ({"scale": None}, "--image needs --scale"),
     ],
 )

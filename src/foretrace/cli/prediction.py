@@ -71,6 +71,10 @@ class ObjectOptions:
             raise PredictionError("--height goes with --polygon and --image: a mesh has its own")
         if self.image is None and (self.label is not None or self.invert):
             raise PredictionError("--label and --invert go with --image: leave them out")
+        if self.label is not None and self.invert:
+            raise PredictionError(
+                "--label and --invert given: a label names the object already, leave one out"
+            )
         height = DEFAULT_HEIGHT if self.height is None else self.height
         if self.polygon is not None:
             return Prism(read_polygon(self.polygon, self.scale), height), None
@@ -107,12 +111,13 @@ class PhotoOptions:
     contact_px: tuple[float, float] | None = None
     """Column and row in the photograph of the point to lever at, on the object's upper rim."""
     camera: Path | None = None
-    """The camera's JSON file, from `foretrace calibrate`; by default camera.json beside the photograph."""
+    """The camera's file, JSON of `foretrace calibrate` or YAML of ROS, OpenCV or Kalibr; by default camera.json beside the
+    photograph."""
     markers: Path | None = None
     """Layout of the markers on the table; by default markers.json beside the photograph. Not needed with --depth."""
     depth: Path | None = None
-    """Depth image of the photograph's size: PNG of 16 bits in millimetres, or .npy in metres. Shows the table and
-    measures the object's height, unless --height is given."""
+    """Depth image of the photograph's size: PNG or TIFF of 16 bits in millimetres, .npy or TIFF of floats in metres.
+    Shows the table and measures the object's height, unless --height is given."""
     background: Path | None = None
     """Photograph of the table without the object."""
     found: PhotoConfig = field(default_factory=PhotoConfig)
