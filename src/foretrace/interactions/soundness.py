@@ -1,6 +1,7 @@
 """Faults of the rows in a shard: what nothing that reads a data set should meet."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 import pyarrow as pa
@@ -29,8 +30,8 @@ def find_faults(table: pa.Table) -> Iterator[tuple[int, str]]:
     numbers = np.arange(table.num_rows)
     whole = np.ones(table.num_rows, dtype=bool)
     for name in table.column_names:
-        missing = table[name].is_null().to_numpy(zero_copy_only=False)
-        if name not in storage.OPTIONAL_COLUMNS and missing.any():
+        if name not in storage.OPTIONAL_COLUMNS and table[name].null_count:
+            missing = table[name].is_null().to_numpy(zero_copy_only=False)
             yield from _at(numbers, missing, f"{name} is missing")
             whole &= ~missing
         elif pa.types.is_list(table.schema.field(name).type):
@@ -98,10 +99,8 @@ def _of_whole_rows(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int, 
         yield from _of_actions(table, numbers)
     if "versions" in names:
         for text, row in _firsts(table["versions"].to_pylist()):
-            try:
-                conform(parse_json(text), dict[str, str], "versions", DatasetError, "simulate again")
-            except (ValueError, DatasetError) as reason:
-                yield int(numbers[row]), f"versions cannot be read ({reason})"
+            if problem := _odd_versions(text):
+                yield int(numbers[row]), problem
 
 
 def _of_trajectories(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int, str]]:
@@ -111,7 +110,8 @@ def _of_trajectories(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int
     steps = np.diff(times.values.to_numpy(), prepend=-np.inf)
     firsts = times.offsets.to_numpy()[:-1]
     steps[firsts[samples > 0]] = np.inf
-    yield from _at(numbers, _rows_with(times, steps <= 0), "its times do not rise")
+    if (steps <= 0).any():
+        yield from _at(numbers, _rows_with(times, steps <= 0), "its times do not rise")
     if "outcome" in names:
         failed = np.array(table["outcome"].to_pylist()) == FAILED
         yield from _at(numbers, (samples == 0) & ~failed, "it has no samples although it did not fail")
@@ -123,12 +123,12 @@ def _of_trajectories(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int
             yield int(numbers[row]), f"{name} has {lengths[row]} numbers for {samples[row]} samples"
         if widths[name] == 7 and (lengths == 7 * samples).all():
             values = table[name].combine_chunks()
+            quaternions = values.values.to_numpy().reshape(-1, 7)[:, 3:]
             with np.errstate(all="ignore"):
-                norms = np.linalg.norm(values.values.to_numpy().reshape(-1, 7)[:, 3:], axis=1)
-                odd = np.repeat(np.abs(norms - 1) > QUATERNION_TOLERANCE, 7)
-            yield from _at(
-                numbers, _rows_with(values, odd), f"a quaternion of {name} has a norm other than 1"
-            )
+                norms = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
+            if (odd := np.abs(norms - 1) > QUATERNION_TOLERANCE).any():
+                text = f"a quaternion of {name} has a norm other than 1"
+                yield from _at(numbers, _rows_with(values, np.repeat(odd, 7)), text)
     for name in filter(names.__contains__, INDICES):
         index = table[name].to_numpy(zero_copy_only=False).astype(float)
         yield from _at(numbers, (index < 0) | (index > samples), f"{name} is no sample of it")
@@ -139,11 +139,9 @@ def _of_actions(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int, str
     kinds = list(zip(*texts, strict=True))
     outcomes = table["outcome"].to_pylist() if "outcome" in table.column_names else [FAILED] * len(kinds)
     allowed: dict[tuple[str, str, str], tuple[str, ...]] = {}
-    place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
     for kind, row in _firsts(kinds):
-        settings = dict(zip(("action", "path", "tool"), kind, strict=True))
         try:
-            allowed[kind] = (*storage.decode_action(settings | place).outcomes, FAILED)
+            allowed[kind] = _outcomes_of(*kind)
         except (ActionError, ValueError) as reason:
             yield int(numbers[row]), str(reason)
     for row, (kind, outcome) in enumerate(zip(kinds, outcomes, strict=True)):
@@ -151,8 +149,25 @@ def _of_actions(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int, str
             yield int(numbers[row]), f"it has the unknown outcome {shown(outcome)}"
 
 
+# Of a data set's texts, few differ from shard to shard.
+@lru_cache(maxsize=1024)
+def _outcomes_of(action: str, path: str, tool: str) -> tuple[str, ...]:
+    place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
+    decoded = storage.decode_action({"action": action, "path": path, "tool": tool, **place})
+    return (*decoded.outcomes, FAILED)
+
+
+@lru_cache(maxsize=64)
+def _odd_versions(text: str) -> str | None:
+    try:
+        conform(parse_json(text), dict[str, str], "versions", DatasetError, "simulate again")
+    except (ValueError, DatasetError) as reason:
+        return f"versions cannot be read ({reason})"
+    return None
+
+
 def _at(numbers: np.ndarray, wrong: np.ndarray, problem: str) -> Iterator[tuple[int, str]]:
-    return ((int(number), problem) for number in numbers[np.asarray(wrong, dtype=bool)])
+    return ((int(number), problem) for number in (numbers[wrong] if wrong.any() else ()))
 
 
 def _firsts(values: list) -> Iterator[tuple]:

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int, Shaped
 
-from foretrace.errors import ForetraceError, ShapeError, is_number, shown
+from foretrace.errors import ForetraceError, ShapeError, fault, is_number, shown
 from foretrace.geometry import cross, mask_outline, polygon_area
 from foretrace.images import StoredImage, check_pixels
 from foretrace.objects.object_pixels import MOST_PIXELS, SPECK, Label, object_pixels
@@ -129,7 +129,7 @@ def _check_border(found: Bool[np.ndarray, "rows columns"], hole: float) -> None:
 def check_scale(metres_per_pixel: Any, error: type[ForetraceError]) -> None:
     """Refuse an image's scale [m] that no image has, by an error of the given class."""
     if not is_number(metres_per_pixel) or not FINEST <= metres_per_pixel <= COARSEST:
-        raise error(
+        raise fault(error, is_number(metres_per_pixel))(
             f"scale of {shown(metres_per_pixel)} m per pixel: give a length from {FINEST:g} to {COARSEST:g} m"
         )
 
