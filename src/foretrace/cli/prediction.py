@@ -111,8 +111,8 @@ class PhotoOptions:
     contact_px: tuple[float, float] | None = None
     """Column and row in the photograph of the point to lever at, on the object's upper rim."""
     camera: Path | None = None
-    """The camera's file, JSON of `foretrace calibrate` or YAML of ROS, OpenCV or Kalibr; by default camera.json beside the
-    photograph."""
+    """The camera's file, JSON of `foretrace calibrate` or YAML of ROS, OpenCV or Kalibr; by default camera.json beside
+    the photograph."""
     markers: Path | None = None
     """Layout of the markers on the table; by default markers.json beside the photograph. Not needed with --depth."""
     depth: Path | None = None
