@@ -142,7 +142,7 @@ def test_engines_agree(label):
         ((0.0, 0.0, 0.0), (1.0, 0.0), "contact .* expected two finite numbers"),
         (None, (1.0, 0.0), "contact None: expected two finite numbers"),
         ((0.0, 0.0), (0.0, 0.0), "has no length"),
-        ((0.0, 0.0), "ahead", "direction ahead: expected two finite numbers"),
+        ((0.0, 0.0), "ahead", "direction .ahead.: expected two finite numbers"),
         ((0.5, 0.5), (1.0, 0.0), "from the object's outline: take .*at_edge"),
     ],
 )

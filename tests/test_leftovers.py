@@ -178,7 +178,8 @@ def stopped(config: CollectConfig, id: int):
 @pytest.mark.parametrize("killed", ["in the notes", "in the shard", "in the manifest"])
 def test_an_import_goes_on_that_was_killed_before_its_first_manifest(tmp_path, killed):
     interaction = Dataset.open(fake_data_set(tmp_path / "fake", objects=1))[0]
-    notes = {"recording": "film", "camera": {}, "T_action_camera": [], "start": 0.0, "frame_times": []}
+    pose = np.eye(4).tolist()
+    notes = {"recording": "film", "camera": {}, "T_action_camera": pose, "start": 0.0, "frame_times": []}
     folder, whole = begun(tmp_path / "data", "manifest.json"), tmp_path / "whole"
     assert recorded.add_recorded(whole, interaction, notes) == 0
     for name in (recorded.NOTES_FOLDER, storage.SHARD_FOLDER):

@@ -174,7 +174,7 @@ def test_wrong_input_is_one_clear_line(
         "--seconds is nan": ["capture", str(tmp_path / "film"), "--seconds", "nan"],
         "none, im-cnn": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--features", "sift"],
         str(tmp_path / "empty"): ["predict", str(tmp_path / "empty"), *shape, "--edge", "0"],
-        "give the folder of a training": ["evaluate", "predictor", str(data), "--data", str(data)],
+        "give the folder of a trained predictor": ["evaluate", "predictor", str(data), "--data", str(data)],
     }
     for expected, arguments in cases.items():
         assert expected in error_of(arguments, capsys), arguments

@@ -117,7 +117,7 @@ GOOD = LeverUp.at_edge(PENTAGON, 0).to_dict()
         ({"path": None}, "action 'lever-up' cannot be read"),
         ({"tool": {"label": "spoon"}}, "unknown tool 'spoon'; available: screwdriver, rod"),
         ({"tool": {"label": "rod", "girth": 1.0}}, "tool 'rod' cannot be read"),
-        ({"tool": Rod().to_dict()}, r"(?s)Rod\(.*Screwdriver"),
+        ({"tool": Rod().to_dict()}, "give a Screwdriver|TypeCheckError"),
     ],
 )
 def test_damaged_actions_are_refused(change, message):
