@@ -216,6 +216,23 @@ def test_a_file_that_says_something_else_is_refused(command, change, message):
         exporting.compare(network_of(other), file, np.random.default_rng(0))
 
 
+def test_rounding_of_noise_excuses_no_difference_for_views(command, monkeypatch):
+    _, file, _ = command
+    noisy = []
+
+    def draw(network, rng, number, noise):
+        noisy.append(noise)
+        return draw_inputs(network, rng, number, noise)
+
+    def difference(name, found, wanted, own):
+        return 1e-4 if found is not own else 1e-2 if noisy[-1] else 1e-6
+
+    monkeypatch.setattr(exporting, "draw_inputs", draw)
+    monkeypatch.setattr(exporting, "_difference", difference)
+    with pytest.raises(ExportError, match=r"0\.0001 away from float64, PyTorch's 1e-06"):
+        exporting.compare(network_of(one_shot()), file, np.random.default_rng(0))
+
+
 def test_nothing_is_overwritten_and_a_missing_library_is_named(tmp_path, monkeypatch):
     there = tmp_path / "model.onnx"
     there.write_text("mine")

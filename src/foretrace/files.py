@@ -26,7 +26,7 @@ LARGEST_TEXT = 2**28
 PARTIAL = ".partial"
 """Ending of a file or folder that is being written."""
 DRAFT = re.compile(rf"\..*\.(?P<here>[0-9a-f]{{6}})-(?P<process>\d+)-\d+{re.escape(PARTIAL)}", re.DOTALL)
-"""Their names, which tell whose they are."""
+"""Names of such files and folders, with the machine and the process that write them."""
 OLD = 24 * 3600.0
 """A draft last touched longer ago is the rest of an interrupted run, whoever has its process number now [s]."""
 _numbers = itertools.count()

@@ -30,6 +30,8 @@ TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """How TIFF files begin; so do none of the other formats."""
 DAMAGED = "it is damaged or cut off"
 REMEDY = "give a whole PNG, JPEG, WebP, TIFF or BMP file"
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+"""Endings of image files that are looked for in a folder."""
 ORIENTATION = 0x0112
 """The tag that says how viewers turn and mirror the stored pixels (EXIF 2.3, section 4.6.4)."""
 BACK = {6: 8, 8: 6}
@@ -202,7 +204,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _mute() -> Iterator[None]:
-    """The process's standard error goes nowhere: libtiff and libpng write there, whatever they are told."""
+    """Discard the process's standard error, to which libtiff and libpng write without being asked."""
     shown, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nothing, 2)

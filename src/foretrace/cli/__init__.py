@@ -45,7 +45,7 @@ COMMANDS: dict[str, Entry] = {
     "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
     "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
     "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
-    "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or write its calibration board.", SEE),
+    "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or print its board or markers.", SEE),
     "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),
     "film": _command("film:film", "Render a recording of a simulated lever-up.", SEE),
     "capture": _command("capture:capture", "Record with a RealSense camera (experimental).", SEE),
@@ -57,9 +57,9 @@ COMMANDS: dict[str, Entry] = {
 
 
 KILLED = 128
-"""Exit status after a signal that asks to end, less the signal's number: 130 after Ctrl-C, as a shell says."""
+"""Added to a signal's number, the exit status after it, as in a shell: 130 after Ctrl-C."""
 FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
-"""What the system says of a disk without space, a used-up quota, and a file longer than it may be."""
+"""The system's errors for a disk without space, a used-up quota, and a file longer than it may be."""
 OUTPUT_CLOSED = 141
 """Exit status where whoever read the output has closed it, as `head` does: what a shell says of SIGPIPE."""
 

@@ -85,7 +85,7 @@ def export_lerobot(
 
 
 def export_onnx(run: Positional[Path | None] = None, out: Path = Path("model.onnx")) -> None:
-    """Write a predictor's network as an ONNX file, and compare it with PyTorch. Needs foretrace[onnx].
+    """Write a predictor's network as an ONNX file, and compare its outputs with float64. Needs foretrace[onnx].
 
     Args:
         run: Folder of the training; by default the predictor that comes with foretrace.

@@ -22,7 +22,7 @@ from foretrace.predictor import load_predictor
 from foretrace.trajectories import interpolate_poses
 
 SAME_TIME = 0.001
-"""Time stamps of a recording may be told so differently [s]."""
+"""Largest difference between the time stamps of an imported frame and of the recording's own [s]."""
 
 
 def overlay(

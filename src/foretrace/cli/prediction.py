@@ -111,13 +111,12 @@ class PhotoOptions:
     contact_px: tuple[float, float] | None = None
     """Column and row in the photograph of the point to lever at, on the object's upper rim."""
     camera: Path | None = None
-    """The camera's file, JSON of `foretrace calibrate` or YAML of ROS, OpenCV or Kalibr; by default camera.json beside
-    the photograph."""
+    """The camera's file, JSON or YAML of ROS, OpenCV or Kalibr; by default camera.json beside the photograph."""
     markers: Path | None = None
     """Layout of the markers on the table; by default markers.json beside the photograph. Not needed with --depth."""
     depth: Path | None = None
-    """Depth image of the photograph's size: PNG or TIFF of 16 bits in millimetres, .npy or TIFF of floats in metres.
-    Shows the table and measures the object's height, unless --height is given."""
+    """Depth image of the photograph's size, PNG, TIFF or .npy: whole numbers in millimetres, fractions in metres. Shows
+    the table and measures the object's height, unless --height is given."""
     background: Path | None = None
     """Photograph of the table without the object."""
     found: PhotoConfig = field(default_factory=PhotoConfig)

@@ -65,7 +65,7 @@ def robot(
         yes: Do not ask before the arm moves.
         camera: Film the motion into the folder's film: number of a camera, or what else OpenCV opens.
         correction: Deviation of the blade's tip by the arm's own calibration, X Y Z in the table frame [m], as the
-            command tells it before the blade goes down.
+            command gives it before the blade goes down.
         is_ur10: The arm is a UR10 (CB3); for a controller before PolyScope 3.12, which cannot say so.
     """
     if execute and host is None:
@@ -77,7 +77,7 @@ def robot(
         check_host(host)
     if not all(abs(value) <= OTHER_ARM for value in correction):
         raise RobotError(
-            f"--correction {' '.join(map(str, correction))}: give metres, at most {OTHER_ARM:g}, as this command tells"
+            f"--correction {' '.join(map(str, correction))}: give metres, at most {OTHER_ARM:g}, as the command gives it"
         )
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)

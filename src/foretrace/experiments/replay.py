@@ -30,7 +30,7 @@ FACE_TOLERANCE = np.deg2rad(20.0)
 ESTIMATE_TIME = 0.1
 """Velocities that are not recorded are estimated from the frames of this time [s], from at least three."""
 CLEARANCE = 0.002
-"""An object that a tracker sees at least so far above the table touches nothing [m]."""
+"""Height above the table from which a tracked object is taken to touch nothing [m]."""
 TIMESTEP = 0.001
 """Time step of the simulation [s]."""
 COLUMNS = {
@@ -240,7 +240,7 @@ def estimate_velocity(recording: Recording) -> Float[np.ndarray, " 6"]:
 
 
 def _frames_in_flight(recording: Recording, most: int) -> int:
-    """Number of the first frames, at most so many, before the object meets the table.
+    """Number of frames before the object meets the table, ``most`` at the most.
 
     An object whose next frame would be in the table has touched it by then, even where that frame shows it above.
     """

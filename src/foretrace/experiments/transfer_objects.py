@@ -18,6 +18,7 @@ from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, ShapeError
 from foretrace.files import read_json
 from foretrace.geometry import convex_hull, inward_normals
+from foretrace.images import SUFFIXES
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.objects import Prism, read_silhouette
 from foretrace.objects.everyday import EVERYDAY, HEPTAGON, PENTAGON
@@ -28,7 +29,6 @@ from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.stand_in import Observation, StandIn
 
 Group = Literal["printed", "everyday", "silhouettes", "prisms"]
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 GIVEN_SIZE = 0.18
 """Longer side of given silhouettes [m]."""
 GIVEN_HEIGHT = 0.02
@@ -144,10 +144,10 @@ def read_silhouettes(
     """
     if not folder.is_dir():
         raise ShapeError(f"{folder} is no folder: give one with pictures of silhouettes, white on black")
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
     if not files:
         raise ShapeError(
-            f"{folder} has no silhouettes: put pictures there ({', '.join(PICTURES)}), one object each"
+            f"{folder} has no silhouettes: put images there ({', '.join(SUFFIXES)}), one object each"
         )
     subjects = []
     for file in files:

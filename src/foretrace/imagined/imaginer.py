@@ -215,7 +215,7 @@ class Imaginer(ABC):
         check_type("view", view, TopDownView, PredictionError)
         check_object(view.mask, view.height)
         check_type("actions", actions, Iterable, PredictionError, "a list of actions")
-        if getattr(actions, "ndim", 1) == 0:  # an array of one thing says that it can be gone through
+        if getattr(actions, "ndim", 1) == 0:  # an array without axes counts as iterable
             raise PredictionError("actions are one value: give a list of actions")
         actions = tuple(actions)
         if not actions:

@@ -101,7 +101,7 @@ def read_depth(path: Path) -> Float[np.ndarray, "rows columns"]:
     Raises:
         PerceptionError: It is missing, cannot be read, is no such image, or its unit cannot be right.
     """
-    remedy = "give a PNG of 16 bits per pixel in millimetres, or a .npy array (rows, columns) in metres"
+    remedy = "give a PNG of 16 bits per pixel in millimetres, or a .npy array of fractions in metres"
     if not path.is_file():
         raise PerceptionError(f"depth image {path} does not exist: {remedy}")
     if path.suffix.lower() == ".npy":

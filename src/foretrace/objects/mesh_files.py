@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from foretrace.errors import ForetraceError, ShapeError, shown
 from foretrace.geometry import polygon_area
 from foretrace.objects.decomposition import Faces, Points
-from foretrace.objects.model import SIZE_LIMITS
+from foretrace.objects.model import SIZE_LIMITS, USUAL_SIZES
 
 READABLE = (".stl", ".obj", ".ply", ".off")
 """Endings of mesh files that are read; z is up in all of them."""
@@ -32,14 +32,12 @@ LARGEST_FILE = 200_000_000
 """Larger mesh files are refused [bytes]."""
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "metres": 1.0}
 """Units of mesh files [m]."""
-USUAL_SIZES = (0.03, 0.5)
+PLAUSIBLE = (0.03, 0.5)
 """An object is expected to be as long as this when its unit is guessed [m]."""
 LARGEST_COORDINATE = 1e9
 """Coordinates beyond are no object of any unit: their products would overflow."""
 FLAT = 1 - 1e-6
 """Cosine of the angle between faces in one plane."""
-POINTED_OUT = (0.02, 0.4)
-"""Smaller and larger objects are unusual, and pointed out [m]."""
 COARSEST = 2e-3
 """Largest rounding of coordinates, relative to the mesh's smallest extent."""
 
@@ -159,12 +157,12 @@ def check_unit(extents: Float[np.ndarray, "3"], scale: float) -> None:
     """
     size = float(extents.max())
     lengths = " x ".join(f"{length * scale:.4g}" for length in extents)
-    if POINTED_OUT[0] <= size * scale <= POINTED_OUT[1]:
+    if USUAL_SIZES[0] <= size * scale <= USUAL_SIZES[1]:
         return
     if SIZE_LIMITS[0] <= size * scale <= SIZE_LIMITS[1]:
         warnings.warn(f"mesh is {lengths} m at a scale of {scale:g}: check its unit", stacklevel=3)
         return
-    for low, high in (USUAL_SIZES, SIZE_LIMITS):
+    for low, high in (PLAUSIBLE, SIZE_LIMITS):
         guesses = [name for name, unit in UNITS.items() if low <= size * unit <= high]
         if guesses:
             names = " or ".join(guesses)

@@ -19,6 +19,8 @@ from foretrace.schema import parse_json
 
 SIZE_LIMITS = (0.01, 1.0)
 """Smallest and largest believable length of an object [m]: anything else is a wrong unit or scale."""
+USUAL_SIZES = (0.02, 0.4)
+"""Smaller and larger objects are unusual, and pointed out [m]."""
 HEIGHT_LIMITS = (0.001, 1.0)
 """Smallest and largest believable height of an object [m]."""
 

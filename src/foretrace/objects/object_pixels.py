@@ -13,9 +13,9 @@ from foretrace.images import StoredImage
 MOST_PIXELS = 40_000_000
 """Larger masks are refused: an outline needs no more, and they would take seconds and gigabytes."""
 ANALYSED = 2000
-"""Labels are looked for in at most about so many rows and columns, of larger images in every nth."""
+"""Largest number of rows and columns in which labels are looked for; larger images are sampled."""
 THICK = 9
-"""A value that fills a square of so many pixels is a label: wider than JPEG's and blur's traces of one value."""
+"""Side of the square that a label's value fills somewhere [pixel]; traces of JPEG and of blur are narrower."""
 FEW_VALUES = 16
 """An image of more values has blurred edges, noise or JPEG's traces; neighbouring values are one label then."""
 SAME_LABEL = (0.02, 0.1)
@@ -26,7 +26,7 @@ BLURRED = "is blurred or was compressed as JPEG: save labels as PNG, or paint th
 SPECK = 0.01
 """Objects below this share of the largest one's area are taken for noise."""
 SHOWN = 8
-"""At most so many values are named in a message."""
+"""Largest number of values that a message names."""
 Label = int | float | Sequence[int] | Sequence[float]
 """Value of an object's pixels, index into the palette of an image that has one, or red, green and blue."""
 

@@ -39,7 +39,7 @@ PLAUSIBLE = (0.02, 0.5)
 
 
 class Row(NamedTuple):
-    """A line that says something."""
+    """A line of a table that is not empty."""
 
     line: int
     text: str

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from foretrace.errors import ForetraceError, ShapeError, fault, is_number, shown
 from foretrace.geometry import cross, mask_outline, polygon_area
 from foretrace.images import StoredImage, check_pixels
+from foretrace.objects.model import USUAL_SIZES
 from foretrace.objects.object_pixels import MOST_PIXELS, SPECK, Label, object_pixels
 
 CUT_OFF = 0.25
@@ -40,8 +41,6 @@ LEAST_SINE = 0.17
 """Corners sharper than 20 degrees are put back no further than one of these."""
 FINEST, COARSEST = 1e-6, 0.1
 """Sides of the smallest and of the largest pixels of images [m]."""
-LIKELY_SIZES = (0.02, 0.4)
-"""Objects that are levered are no smaller and no larger, as a rule [m]."""
 LOST_AREA = 0.03
 """Refined corners that lose or gain more than this share of the object's area have lost a part of it."""
 FIT_ROUNDS = 5
@@ -136,7 +135,7 @@ def check_scale(metres_per_pixel: Any, error: type[ForetraceError]) -> None:
 
 def likelier_scale(size: float, metres_per_pixel: float) -> str | None:
     """Which scale is likelier than the one [m] that gives an object its size [m]; None where the size is usual."""
-    low, high = LIKELY_SIZES
+    low, high = USUAL_SIZES
     if low <= size <= high:
         return None
     power = float(10.0 ** np.round(np.log10(np.sqrt(low * high) / size)))

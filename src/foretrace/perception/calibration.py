@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from foretrace.errors import PerceptionError
+from foretrace.images import SUFFIXES
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import read_image
 from foretrace.perception.board import FEWEST_CORNERS, Board, recognise, spans_plane
@@ -35,11 +36,9 @@ LEAST_FILL = 0.35
 LEAST_COVER = 0.6
 """Least part of the image's width and height over which the board should have been."""
 LEAST_BEND = 0.0002
-"""Least bend of a board that is told [m]."""
+"""Least bend of a board that is reported [m]."""
 LARGEST_RATIO = 0.05
-"""Largest relative error of a marker's stated side in its square that passes without a word."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Endings of image files."""
+"""Largest relative error of a marker's stated side in its square that is not reported."""
 
 
 @dataclass(frozen=True)

@@ -64,12 +64,12 @@ def video_frames(path: Path) -> Iterator[Frame]:
     time, end = None, 0.0
     try:
         with open(path, "rb") as file, av.open(file, mode="r", metadata_errors="replace") as video:
-            films = [one for one in video.streams.video if not one.disposition & Disposition.attached_pic]
-            if not films:
+            streams = [one for one in video.streams.video if not one.disposition & Disposition.attached_pic]
+            if not streams:
                 raise PerceptionError(f"video {path} has no moving images: give the file that has them")
-            # AVI tells when frames are decoded; those that wait for others are shown at the times in their order.
+            # AVI states when frames are decoded; reordered ones are shown at the same times, in their own order.
             in_order: deque[int | None] | None = deque() if video.format.name == "avi" else None
-            for packet in video.demux(films[0]):
+            for packet in video.demux(streams[0]):
                 if packet.is_corrupt:
                     raise _damaged(path, time, "incomplete data")
                 if in_order is not None and packet.size:
@@ -81,7 +81,7 @@ def video_frames(path: Path) -> Iterator[Frame]:
                     time = float(stamp * frame.time_base)
                     end = max(end, time + float((frame.duration or 0) * frame.time_base))
                     yield Frame(time, frame.to_ndarray(format="bgr24"))
-            if time is not None and end < _stated_end(films[0].metadata) - SLACK:
+            if time is not None and end < _stated_end(streams[0].metadata) - SLACK:
                 raise _damaged(path, time, "the images after that are missing")
     except (OSError, ValueError, av.error.FFmpegError) as error:
         raise _damaged(path, time, getattr(error, "strerror", None) or str(error)) from error

@@ -39,7 +39,7 @@ STOP_DECELERATION = 2.0
 LOOKAHEAD, GAIN = 0.1, 300.0
 """Smoothing of the set points [s], and stiffness, of URScript's servoj: its defaults."""
 MOST_MESSAGES = 1000
-"""So many messages may come before the one that is waited for."""
+"""Largest number of other messages before the one that is waited for."""
 VARIABLES = [
     "timestamp",
     "actual_q",

@@ -73,7 +73,8 @@ def _bouncing(restitution: float, timestep: float) -> list[float]:
     """Time constant [s] and damping ratio of contacts that return this share of an impact's speed.
 
     MuJoCo has no coefficient of restitution: its contacts are a spring and a damper that push but never pull. They
-    are made as stiff as the time step bears. Contacts of ``STRONGEST_DAMPING`` return the least, 0.02.
+    are made as stiff as the time step bears. Contacts of ``STRONGEST_DAMPING`` return the
+    least, 1 to 2 %.
     """
     # A spring and damper that let go when their force vanishes (Schwager and Poeschel, 2007), below and above
     # critical damping.
