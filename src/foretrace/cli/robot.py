@@ -77,7 +77,7 @@ def robot(
         check_host(host)
     if not all(abs(value) <= OTHER_ARM for value in correction):
         raise RobotError(
-            f"--correction {' '.join(map(str, correction))}: give metres, at most {OTHER_ARM:g}, as the command gives it"
+            f"--correction {' '.join(map(str, correction))}: give metres, at most {OTHER_ARM:g}, as this command does"
         )
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
