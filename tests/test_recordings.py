@@ -102,7 +102,8 @@ def test_recordings_are_data_like_any_other(
     ]
     assert main(command) == 0
     assert "interaction 0: levered" in capsys.readouterr().out
-    assert add_recorded(out, imported.interaction, {"camera": "the same"}) == 1
+    first = json.loads((out / "recordings" / "00000.json").read_text())
+    assert add_recorded(out, imported.interaction, first) == 1
     dataset = Dataset.open(out)
     assert len(dataset) == 2
     assert dataset.table["object_id"].to_pylist() == [0, 0]
@@ -362,7 +363,7 @@ def test_a_film_does_not_take_the_place_of_a_file(tmp_path: Path, capsys: pytest
     out = tmp_path / "film"
     out.write_text("kept")
     assert main(["film", str(tmp_path), "0", "--out", str(out)]) == 2
-    assert f"{out} is in use" in capsys.readouterr().err
+    assert f"{out} is a file: name a folder" in capsys.readouterr().err
     assert out.read_text() == "kept"
 
 
