@@ -91,13 +91,13 @@ def _old(here: Path, materials: Path) -> None:
 
 
 TRAIN = "train --data {m}/data --out out --epochs 2 --min-steps 1 --threads 1"
-IMPORT = "import {m}/recording --contact-px 466.3 178.1 --object {m}/object.json --out"
+IMPORT = "import {m}/recording --object {m}/object.json --contact-px"
 JOBS: dict[str, Job] = {
     "simulate": Job("simulate --objects 1 --contacts-per-edge 1 --embodiment tool --workers 1 --out out"),
     "train lstm": Job(TRAIN + " --features none --hidden 4", costly=True),
     "train one-shot": Job(TRAIN + " --predictor one-shot --hidden 8", costly=True),
-    "import": Job(IMPORT + " out", costly=True),
-    "import more": Job(IMPORT + " imported", _copied("imported"), costly=True),
+    "import": Job(IMPORT + " 466.3 178.1 --out out", costly=True),
+    "import more": Job(IMPORT + " 470.0 181.0 --out imported", _copied("imported"), costly=True),
     "film": Job("film {m}/data 0 --out out --width 320 --fps 4 --exposures 1 --depth-every 8"),
     "evaluate": Job("evaluate predictor {m}/lstm --data {m}/data --out out"),
     "export rosbag": Job("export rosbag --data {m}/data --ids 0 1 --no-camera --out out"),
@@ -320,7 +320,7 @@ def contents_of(folder: Path) -> dict[str, str]:
 
 
 def _timeless(file: Path) -> bytes:
-    """The content without the entries that tell time."""
+    """The content without the entries that tell time or place."""
     content = file.read_bytes()
     if file.name == "metrics.csv":
         rows = list(csv.DictReader(content.decode().splitlines()))
@@ -336,6 +336,8 @@ def _timeless(file: Path) -> bytes:
 def _without_times(content: Any) -> Any:
     if isinstance(content, dict):
         return {name: _without_times(value) for name, value in content.items() if name not in TIMES}
+    if isinstance(content, str) and content.startswith("../"):
+        return content.rpartition("/")[2]  # the way from the trial's folder to the materials
     return [_without_times(each) for each in content] if isinstance(content, list) else content
 
 

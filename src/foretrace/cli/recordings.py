@@ -1,5 +1,6 @@
 """The command that imports a recording."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +13,7 @@ from foretrace.cli.contact import ContactOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PerceptionError
 from foretrace.interactions.pinhole import PinholeCamera
-from foretrace.interactions.recorded import add_recorded, place_of
+from foretrace.interactions.recorded import add_recorded, find_recorded, place_of
 from foretrace.interactions.recording_folder import CAMERA, MARKERS
 from foretrace.objects.shape_files import read_shape
 from foretrace.perception import importing
@@ -77,9 +78,12 @@ def import_recording(
     where = Contact(at.contact, contact_px, at.share)
     shape = None if object is None else read_shape(object, config.height, scale, rest)
     found = importing.import_recording(opened, taken_by, MarkerLayout.load(layout), where, shape, config)
-    id = add_recorded(
-        out, found.interaction, _notes(place_of(recording, out) | {"topic": topic}, taken_by, found)
-    )
+    notes = _notes(place_of(recording, out) | {"topic": topic}, taken_by, found)
+    id = find_recorded(out, found.interaction, notes)
+    if id is None:
+        id = add_recorded(out, found.interaction, notes)
+    else:
+        warnings.warn(f"{out} has this recording already: nothing is added", stacklevel=2)
     effect, track = found.interaction.effect, found.track
     missing = int((~track.seen).sum())
     print(

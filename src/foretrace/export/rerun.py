@@ -12,6 +12,7 @@ from foretrace.export.delivery import delivered, watched
 from foretrace.export.episodes import Episode
 from foretrace.export.images import RenderedImages, images_of_samples
 from foretrace.export.scenery import IMAGINED, OBJECT, OBSERVED, Colour
+from foretrace.files import write_bytes
 from foretrace.geometry import quaternion_to_matrix, tilt
 from foretrace.interactions.record import Effect
 from foretrace.objects.surface import triangles_of
@@ -50,7 +51,9 @@ def write_recording(episode: Episode, path: Path, camera: bool) -> None:
     recording = rr.RecordingStream(
         APPLICATION, recording_id=f"interaction-{interaction.id}", send_properties=False
     )
-    recording.save(path, default_blueprint=_blueprint(seen is not None))
+    # In memory first: the thread that writes files for Rerun never ends on a full disk, at times.
+    memory = recording.memory_recording()
+    recording.send_blueprint(_blueprint(seen is not None), make_active=False)
     recording.send_recording_name(f"interaction {interaction.id}: {effect.outcome}")
     _log_scene(recording, episode)
     _log_motion(recording, episode)
@@ -58,6 +61,7 @@ def write_recording(episode: Episode, path: Path, camera: bool) -> None:
     if seen is not None:
         _log_images(recording, effect.times, seen)
     recording.flush()
+    write_bytes(path, memory.drain_as_bytes())
     recording.disconnect()
 
 

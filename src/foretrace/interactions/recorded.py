@@ -24,6 +24,8 @@ from foretrace.schema import Finite, Transform
 CONFIGURATION = {"source": "recorded"}
 OBJECTS = "objects"
 """Entry of the manifest with the number of each object, by the hash of its description."""
+REPEAT = "import the recording again"
+"""Remedy for damaged notes."""
 NOTES_FOLDER = "recordings"
 """Folder with a JSON file for each interaction: its camera, and how well it was seen."""
 
@@ -56,7 +58,7 @@ def read_notes(folder: Path, id: int) -> Notes:
     path = folder / NOTES_FOLDER / f"{id:05d}.json"
     if not path.is_file():
         raise DatasetError(f"{folder} has no recording {id}: give a data set that `foretrace import` made")
-    return read_json(path, Notes, DatasetError, "import the recording again")
+    return read_json(path, Notes, DatasetError, REPEAT)
 
 
 def place_of(recording: Path, folder: Path) -> dict[str, str]:
@@ -89,6 +91,39 @@ def find_recording(folder: Path, notes: Mapping[str, Any]) -> Path:
             f"the recording is no longer at {places[0]} or {places[1]}: say where it is with --recording"
         )
     return found
+
+
+def find_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any]) -> int | None:
+    """Number of an interaction in a data set of recordings; None: it is not there.
+
+    It is there if an import is repeated that was stopped after its last write. The same recording read in another way,
+    as another object or at another contact, is another interaction.
+
+    Args:
+        folder: The data set's folder.
+        interaction: What was recorded.
+        notes: What would be kept beside it.
+
+    Raises:
+        DatasetError: The data set is damaged.
+    """
+    if not (folder / storage.MANIFEST).is_file():
+        return None
+    wanted = _without_place(json.loads(json.dumps(notes)))
+    for id in range(storage.read_manifest(folder)["num_trials"]):
+        path = folder / NOTES_FOLDER / f"{id:05d}.json"
+        if path.is_file() and _without_place(read_json(path, dict[str, Any], DatasetError, REPEAT)) == wanted:
+            table, _ = storage.read_shard(folder, storage.shard_name(id))
+            object_ids = table["object_id"].to_pylist()
+            same = storage.to_table([storage.encode(replace(interaction, id=id), each) for each in object_ids])
+            if table.drop_columns(["versions"]).equals(same.drop_columns(["versions"])):
+                return id
+    return None
+
+
+def _without_place(notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Notes without where the recording lay: it may have been moved."""
+    return {name: value for name, value in notes.items() if name not in ("recording", "recording_path")}
 
 
 def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any]) -> int:

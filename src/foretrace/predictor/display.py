@@ -1,5 +1,6 @@
 """What a training shows while it runs: lines and a bar on the terminal, curves in TensorBoard."""
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -18,6 +19,9 @@ def tensorboard(path: Path) -> Iterator[Callable[[Row], None]]:
 
     with ExitStack() as stack:
         writer: SummaryWriter | None = None
+        # What its thread dies of, such as a full disk, is raised again when the rows are flushed: once is enough.
+        stack.callback(setattr, threading, "excepthook", threading.excepthook)
+        threading.excepthook = lambda _: None
 
         def log(row: Row) -> None:
             nonlocal writer
