@@ -1,12 +1,59 @@
 """A sample of the campaign of crash points and damaged inputs; `benchmarks/campaign.py` runs the whole of it."""
 
+import json
+import random
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from campaign import FAULT, OK, answers
+from campaign import FAULT, OK, answers, calls, inputs, writes
+from campaign.draws import drawn
+from campaign.materials import prepare
+from campaign.server import Server
+
+PARTS = [(kind, number) for kind in ("input", "call") for number in range(4)]
+EXAMPLES = 250
+"""Of each part."""
+FEW, COSTLY = 2, 1
+"""Crash points tried of a command, and of one that takes longer."""
+
+
+@pytest.fixture(scope="session")
+def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return prepare(tmp_path_factory.mktemp("campaign") / "materials")
+
+
+@pytest.fixture(scope="module")
+def server(materials: Path) -> Iterator[Server]:
+    with Server(materials) as process:
+        yield process
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, job in writes.JOBS.items() if not job.slow])
+def test_a_command_goes_on_after_it_stopped_at_a_write(name, server, materials):
+    (first,) = server.run({"kind": "write", "job": name, "at": 0, "how": writes.STOP})
+    assert first.ending != FAULT, first.detail
+    count = writes.reference_of(name, materials)["writes"]
+    rng = random.Random(name)
+    points = sorted(rng.sample(range(count), min(count, COSTLY if writes.JOBS[name].costly else FEW)))
+    requests = [{"kind": "write", "job": name, "at": at, "how": rng.choice(writes.WAYS)} for at in points]
+    outcomes = zip(requests, server.run(*requests), strict=True)
+    faults = [f"{request}: {outcome.detail}" for request, outcome in outcomes if outcome.ending == FAULT]
+    assert not faults, "\n".join(faults)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "number"), PARTS)
+def test_whatever_is_given_is_answered_or_refused(kind, number, server, materials):
+    requests = drawn(inputs.requests() if kind == "input" else calls.requests(materials), number, EXAMPLES)
+    outcomes = zip(requests, server.run(*requests), strict=True)
+    faults = [f"{outcome.detail}: {json.dumps(one)}" for one, outcome in outcomes if outcome.ending == FAULT]
+    assert not faults, "\n".join(faults)
+
 
 UNSOUND = {
     "a fault of another class": lambda: {}["x"],

@@ -102,6 +102,9 @@ def test_recordings_are_data_like_any_other(
     ]
     assert main(command) == 0
     assert "interaction 0: levered" in capsys.readouterr().out
+    assert main(command) == 0  # as after an interruption of the last moment
+    assert "has this recording already" in capsys.readouterr().err
+    assert len(Dataset.open(out)) == 1
     first = json.loads((out / "recordings" / "00000.json").read_text())
     assert add_recorded(out, imported.interaction, first) == 1
     dataset = Dataset.open(out)

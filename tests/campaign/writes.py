@@ -104,7 +104,7 @@ JOBS: dict[str, Job] = {
     "export rosbag 1": Job("export rosbag --data {m}/data --ids 0 --ros 1 --no-camera --out out"),
     "export rerun": Job("export rerun --data {m}/data --ids 0 1 --no-camera --out out"),
     "export lerobot": Job("export lerobot --data {m}/data --out out"),
-    "export onnx": Job("export onnx {m}/lstm --out out.onnx"),
+    "export onnx": Job("export onnx {m}/lstm --out out.onnx", slow=True),
     "data --repair": Job("data data --repair --out description.json", _damaged),
     "data --upgrade": Job("data old --upgrade", _old),
     "calibrate": Job("calibrate {m}/board --out camera.json"),

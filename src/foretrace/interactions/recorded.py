@@ -115,7 +115,9 @@ def find_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, An
         if path.is_file() and _without_place(read_json(path, dict[str, Any], DatasetError, REPEAT)) == wanted:
             table, _ = storage.read_shard(folder, storage.shard_name(id))
             object_ids = table["object_id"].to_pylist()
-            same = storage.to_table([storage.encode(replace(interaction, id=id), each) for each in object_ids])
+            same = storage.to_table(
+                [storage.encode(replace(interaction, id=id), each) for each in object_ids]
+            )
             if table.drop_columns(["versions"]).equals(same.drop_columns(["versions"])):
                 return id
     return None
