@@ -107,20 +107,23 @@ def find_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, An
     Raises:
         DatasetError: The data set is damaged.
     """
-    if not (folder / storage.MANIFEST).is_file():
+    manifest = storage.read_manifest(folder) if (folder / storage.MANIFEST).is_file() else {}
+    object_id = manifest.get(OBJECTS, {}).get(_object_key(interaction))
+    if object_id is None:
         return None
     wanted = _without_place(json.loads(json.dumps(notes)))
-    for id in range(storage.read_manifest(folder)["num_trials"]):
+    for id in range(manifest["num_trials"]):
         path = folder / NOTES_FOLDER / f"{id:05d}.json"
         if path.is_file() and _without_place(read_json(path, dict[str, Any], DatasetError, REPEAT)) == wanted:
-            table, _ = storage.read_shard(folder, storage.shard_name(id))
-            object_ids = table["object_id"].to_pylist()
-            same = storage.to_table(
-                [storage.encode(replace(interaction, id=id), each) for each in object_ids]
-            )
-            if table.drop_columns(["versions"]).equals(same.drop_columns(["versions"])):
+            row = storage.to_table([storage.encode(replace(interaction, id=id), object_id)])
+            entry = storage.shard_entry(storage.shard_content(row), row)
+            if entry == manifest["shards"].get(storage.shard_name(id)):
                 return id
     return None
+
+
+def _object_key(interaction: Interaction) -> str:
+    return short_hash([json.dumps(interaction.object.to_dict()).encode()])
 
 
 def _without_place(notes: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,8 +159,7 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
             )
         id = manifest["num_trials"]
         objects = manifest.setdefault(OBJECTS, {})
-        described = json.dumps(interaction.object.to_dict())
-        object_id = objects.setdefault(short_hash([described.encode()]), len(objects))
+        object_id = objects.setdefault(_object_key(interaction), len(objects))
         table = storage.to_table([storage.encode(replace(interaction, id=id), object_id)])
         path = folder / NOTES_FOLDER / f"{id:05d}.json"
         write_json(path, dict(notes))

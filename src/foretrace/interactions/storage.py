@@ -255,11 +255,16 @@ def shard_name(index: int) -> str:
 
 def write_shard(folder: Path, name: str, table: pa.Table) -> dict[str, Any]:
     """Write one shard; returns its entry for the manifest (checksum and number of rows)."""
-    buffer = pa.BufferOutputStream()
-    pq.write_table(table.combine_chunks(), buffer, compression="zstd", use_dictionary=False)
-    content = buffer.getvalue().to_pybytes()
+    content = shard_content(table)
     write_bytes(folder / name, content)
     return shard_entry(content, table)
+
+
+def shard_content(table: pa.Table) -> bytes:
+    """The bytes of a shard."""
+    buffer = pa.BufferOutputStream()
+    pq.write_table(table.combine_chunks(), buffer, compression="zstd", use_dictionary=False)
+    return buffer.getvalue().to_pybytes()
 
 
 def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
