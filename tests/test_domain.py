@@ -1,6 +1,5 @@
 import json
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import torch
 from factories import fake_batch
 from foretrace.actions import LeverUp
 from foretrace.errors import CheckpointError, PredictionError
-from foretrace.imagined import Scenes, estimate_com
 from foretrace.imagined.domain import check_view, find_unusual, measure, ranges_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
@@ -147,7 +145,7 @@ def test_a_checkpoint_without_ranges_warns_of_nothing(run, view, tmp_path):
     assert not predictor.ranges
     assert predictor.imagine(view).warnings == ()
     (tmp_path / "config.json").write_text(json.dumps(config | {"ranges": {"area": 3}}))
-    with pytest.raises(CheckpointError, match="incomplete"):
+    with pytest.raises(CheckpointError, match=r"entry ranges\.area is 3, a list is expected"):
         load_predictor(tmp_path)
 
 
@@ -160,17 +158,3 @@ def test_unusual_is_what_is_far_outside():
     }
     told = [[line.split()[0] for line in row] for row in find_unusual(measures, ranges)]
     assert told == [[], ["area"], ["height"], ["area"]]
-
-
-def test_looking_takes_no_time(run, view):
-    predictor = load_predictor(run)
-    batch = InteractionBatch.from_views([view])
-    inputs, com = predictor.features.inputs(batch), estimate_com(batch)
-    seconds = []
-    for _ in range(30):
-        started = perf_counter()
-        check_view(view)
-        scenes = Scenes(batch, com, np.zeros((1, 0)))
-        find_unusual(scenes.measure() | predictor.features.measure(inputs), predictor.ranges)
-        seconds.append(perf_counter() - started)
-    assert min(seconds) < 0.001

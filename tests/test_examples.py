@@ -84,7 +84,7 @@ def test_own_object_from_picture(tmp_path: Path) -> None:
 
 def test_own_mesh() -> None:
     printed = run_python(EXAMPLES / "own_mesh.py")
-    assert "check unit (metres) or scale" in printed
+    assert "looks like millimetres: give --scale 0.001" in printed
     assert "mass: 189 g" in printed  # 600 kg/m^3 x 14 cm x 9 cm x 2.5 cm on average
     assert re.findall(r"^edge (\d): \w+", printed, re.MULTILINE) == ["0", "1", "2", "3"]
 

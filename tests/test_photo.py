@@ -242,7 +242,8 @@ def test_files_and_arrays_give_the_same(recorded: Recorded, images: dict) -> Non
             depth=folder / "depth-00000.png",
             background=folder / "background.png",
         )
-    same = observe_photo(images.pop("image"), CAMERA, contact_pixel(truth), **images)
+    others = {name: image for name, image in images.items() if name != "image"}
+    same = observe_photo(images["image"], CAMERA, contact_pixel(truth), **others)
     np.testing.assert_array_equal(found.view.mask, same.view.mask)
     np.testing.assert_array_equal(found.T_table_camera, same.T_table_camera)
 
