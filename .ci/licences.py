@@ -34,7 +34,7 @@ def main() -> int:
     pins = [line.split("==")[0] for line in PINS.read_text().splitlines() if "==" in line]
     odd = []
     print("| Package | Version | Licence | For |\n| --- | --- | --- | --- |")
-    for name in sorted(["torch", *pins], key=str.lower):
+    for name in sorted({"torch", *pins}, key=str.lower):
         try:
             found = distribution(name)
         except PackageNotFoundError:

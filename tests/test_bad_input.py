@@ -12,7 +12,17 @@ import pytest
 
 import foretrace as ft
 from factories import fake_batch, fake_interaction
-from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError, TrainingError, ViewError
+from foretrace.actions import Rod
+from foretrace.errors import (
+    ActionError,
+    DatasetError,
+    PerceptionError,
+    PredictionError,
+    ShapeError,
+    SimulationError,
+    TrainingError,
+    ViewError,
+)
 from foretrace.interactions.dataset import RowError
 from foretrace.interactions.splits import (
     Split,
@@ -21,8 +31,12 @@ from foretrace.interactions.splits import (
     split_by_object,
     split_by_seed,
 )
+from foretrace.perception.board import Board
+from foretrace.perception.importing import ImportConfig
+from foretrace.perception.photo import PhotoConfig
 from foretrace.predictor import EffectPredictor, PredictorConfig
 from foretrace.simulation.collect import CollectConfig, collect
+from foretrace.simulation.recording import RecordingConfig
 
 pytestmark = pytest.mark.usefixtures("untyped")
 BOX = ft.Box(0.15, 0.14, 0.02)
@@ -54,6 +68,9 @@ REFUSED = {
         "obj of type NoneType": lambda: ft.LeverUp.nearest(None, (0, 0)),
         "ahead is 'a': give a number": lambda: ACTION.moved("a", 0, 0),
         "action of type str": lambda: ft.LeverUp.from_dict("lever-up"),
+        "tool = Rod(length=0.17, radius=0.006): give a Screwdriver": lambda: ft.LeverUp.from_dict(
+            ACTION.to_dict() | {"tool": Rod().to_dict()}
+        ),
         "tool of type list": lambda: ft.LeverUp.from_dict(ACTION.to_dict() | {"tool": [1]}),
         "sweep = True is outside": lambda: ft.ToolPath(sweep=True),
         "sweep = nan is outside": lambda: ft.ToolPath(sweep=np.nan),
@@ -99,6 +116,9 @@ REFUSED = {
         "config of type dict": lambda: ft.simulate_lever_up(BOX, ACTION, {}),
         "execution_error of type tuple": lambda: ft.simulate_lever_up(BOX, ACTION, execution_error=(0, 0, 0)),
         "interaction of type str": lambda: ft.replay("interaction"),
+        "table_side = nan is outside": lambda: RecordingConfig(table_side=np.nan),
+        "largest_side = -1 is outside": lambda: RecordingConfig(largest_side=-1),
+        "table is nan: choose from plain": lambda: RecordingConfig(table=np.nan),
         "objects is 1.5: give a whole number": lambda: CollectConfig(objects=1.5),
         "path of type NoneType": lambda: CollectConfig(path=None),
         "config of type NoneType": lambda: collect(None, "out"),
@@ -113,6 +133,7 @@ REFUSED = {
         "device is 'gpu'": lambda: ft.TrainConfig(device="gpu"),
         "precision is 'fp16'": lambda: ft.TrainConfig(precision="fp16"),
         "learning_rate is inf": lambda: ft.TrainConfig(learning_rate=np.inf),
+        "learning_rate is 1e+308": lambda: ft.TrainConfig(learning_rate=1e308),
         "state is 'poses'": lambda: ft.LstmConfig(state="poses"),
         "residual is 'no'": lambda: ft.LstmConfig(residual="no"),
         "mirrored is None": lambda: ft.OneShotConfig(mirrored=None),
@@ -137,6 +158,22 @@ REFUSED = {
         ),
         "interaction 0 of type str": lambda: ft.InteractionBatch.from_interactions(["x"]),
         "views of type TopDownView": lambda: ft.InteractionBatch.from_views(VIEW),
+        "failed of type list: give True or False": lambda: ft.Dataset.open("data", failed=[]),
+    },
+    PerceptionError: {
+        "hull is nan: give True or False": lambda: PhotoConfig(hull=np.nan),
+        "shadows is 1: give True or False": lambda: ImportConfig(shadows=1),
+        "inverted is '': give True or False": lambda: Board(inverted=""),
+        "height is 1e+200: give metres": lambda: PhotoConfig(height=1e200),
+        "height is '2 cm': give metres": lambda: ImportConfig(height="2 cm"),
+        "sample_period = -1 is outside": lambda: ImportConfig(sample_period=-1),
+        "start = array([], dtype=float64) is outside": lambda: ImportConfig(start=np.array([])),
+        "start = 1e+308 is outside": lambda: ImportConfig(start=1e308),
+    },
+    PredictionError: {
+        "start is array([0., 0.]): choose from": lambda: ft.load_predictor().imagine_batch(
+            ft.InteractionBatch.from_views([VIEW]), np.zeros(2)
+        ),
     },
 }  # fmt: skip
 ROWS = [(error, message) for error, table in REFUSED.items() for message in table]
@@ -215,6 +252,8 @@ SELECTIONS = {
     "array([ True, False]) chooses no rows": lambda data: data[np.array([True, False])],
     "no outcome 'leverd': choose from levered": lambda data: data.where(outcome="leverd"),
     "no column 'outcom' to filter by: choose from outcome": lambda data: data.where(outcom="levered"),
+    "id of type list: give a whole number": lambda data: data.with_id([0]),
+    "the function for num_corners ends with KeyError": lambda data: data.where(num_corners=lambda n: {}[0]),
     "num_corners is compared with 'x': give a number": lambda data: data.where(num_corners="x"),
     "num_corners is compared with None": lambda data: data.where(num_corners=None),
     "the function for num_corners returns": lambda data: data.where(num_corners=lambda n: [True, False]),

@@ -92,7 +92,7 @@ def test_without_depth_the_height_is_given_or_the_default(recorded: Recorded, im
 
     assert height_of() == 0.02
     assert height_of(height=0.024) == 0.024
-    with pytest.raises(PerceptionError, match=r"height is 0\.0: give a positive number of metres"):
+    with pytest.raises(PerceptionError, match=r"height is 0\.0: give metres, above 0"):
         height_of(height=0.0)
 
 

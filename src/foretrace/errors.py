@@ -4,11 +4,12 @@ Every message names the offending value and says what to do; the command line pr
 """
 
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import lru_cache
 from math import prod
 from numbers import Integral, Real
 from reprlib import Repr
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 LONGEST = 600
 """Longest message; of a longer one the middle is left out, since it ends with the remedy."""
@@ -137,6 +138,29 @@ def check_type(
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = wanted or " or ".join(kind.__name__ for kind in kinds if kind is not type(None))
         raise wrong_type(error)(f"{name} of type {type(value).__name__}: give {wanted}")
+
+
+def check_choices(error: type[ForetraceError], settings: Any) -> None:
+    """Refuse a dataclass whose switches are not True or False, or whose choices are not among their ``Literal``.
+
+    Args:
+        error: The class to raise.
+        settings: An instance; fields of other types are not looked at.
+
+    Raises:
+        ForetraceError: Of the given class.
+    """
+    hints = get_type_hints(type(settings))
+    for name in (each.name for each in fields(settings)):
+        value = getattr(settings, name)
+        if hints[name] is bool and not isinstance(value, bool):
+            raise wrong_type(error)(f"{name} is {shown(value)}: give True or False")
+        if get_origin(hints[name]) is Literal:
+            choices = get_args(hints[name])
+            if not (isinstance(value, str) and value in choices):
+                raise fault(error, isinstance(value, str))(
+                    f"{name} is {shown(value)}: choose from {', '.join(choices)}"
+                )
 
 
 def shown(value: object) -> str:

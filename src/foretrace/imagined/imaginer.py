@@ -167,7 +167,7 @@ class Imaginer(ABC):
         """
         check_type("batch", batch, InteractionBatch, PredictionError)
         check_arrays(batch.mask, batch.height)
-        if start not in STARTS:
+        if not isinstance(start, str) or start not in STARTS:
             raise PredictionError(f"start is {shown(start)}: choose from {', '.join(STARTS)}")
         most = len(self.sample_times) - 1
         if isinstance(observed, bool) or not isinstance(observed, int | np.integer) or observed < 0:

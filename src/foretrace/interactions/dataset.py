@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from foretrace.actions import ACTIONS, FAILED
-from foretrace.errors import DatasetError, RowError, ShapeError, is_whole, shown
+from foretrace.errors import DatasetError, RowError, ShapeError, check_type, is_whole, shown
 from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
@@ -70,6 +70,7 @@ class Dataset:
             DatasetError: Nothing there, another format version, or a missing or corrupt shard.
         """
         path = as_path(path, DatasetError)
+        check_type("failed", failed, bool, DatasetError, "True or False")
         manifest = storage.read_manifest(path)
         shards = _Shards(path, manifest["shards"])
         if missing := storage.missing_shards(manifest):
@@ -132,7 +133,13 @@ class Dataset:
         for name, wanted in conditions.items():
             column = self._column(name)
             if callable(wanted):
-                found = np.asarray(wanted(column))
+                try:
+                    found = np.asarray(wanted(column))
+                except Exception as error:
+                    raise DatasetError(
+                        f"the function for {name} ends with {type(error).__name__} ({error}): let it take an array of "
+                        f"shape {column.shape}"
+                    ) from error
                 if found.dtype != bool or found.shape not in ((), column.shape):
                     raise DatasetError(
                         f"the function for {name} returns {found.dtype} of shape {found.shape}: let it return "
@@ -164,6 +171,7 @@ class Dataset:
         Raises:
             DatasetError: It is not among these.
         """
+        check_type("id", id, (int, np.integer), DatasetError, "a whole number")
         found = np.flatnonzero(self.index["id"].to_numpy() == id)
         if len(found) == 0:
             raise DatasetError(f"{self.path} has no interaction {id} among the {len(self)} selected")

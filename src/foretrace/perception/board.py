@@ -10,7 +10,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from foretrace.errors import PerceptionError, check_ranges, check_type, is_whole, shown, wrong_type
+from foretrace.errors import (
+    PerceptionError,
+    check_choices,
+    check_ranges,
+    check_type,
+    is_whole,
+    shown,
+    wrong_type,
+)
 from foretrace.geometry import invert_transform
 from foretrace.interactions.marker_patterns import dictionary
 from foretrace.interactions.pinhole import PinholeCamera
@@ -66,6 +74,7 @@ class Board:
         check_type("dictionary", self.dictionary, str, PerceptionError, "the name of a dictionary of markers")
         limits = {"square_length": (0.0, 1.0), "marker_length": (0.0, 1.0), "first_id": (0, MOST)}
         check_ranges(PerceptionError, "board", self, limits, "give lengths in metres")
+        check_choices(PerceptionError, self)
         columns, rows = self.squares
         if min(columns, rows) < 3:
             raise PerceptionError(f"board of {columns} x {rows} squares: at least 3 x 3 are needed")

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from foretrace.actions import LeverUp, Motion, ToolPath, tool_poses
-from foretrace.errors import PerceptionError, check_type, is_number, shown
+from foretrace.errors import PerceptionError, check_choices, check_ranges, check_type, is_number, shown
 from foretrace.files import versions_of
 from foretrace.geometry import (
     continuous_quaternions,
@@ -30,6 +30,7 @@ from foretrace.perception.tracking import Track, TrackConfig, check_times, still
 from foretrace.perception.views import (
     Observation,
     PlacedObject,
+    check_height,
     contact_at_pixel,
     fit_object,
     observe,
@@ -52,6 +53,12 @@ LEAST_LEVEL = 0.03
 """A marker's height on an object may err by this much before the recording is refused [m]."""
 
 
+LATEST = 1e11
+"""Latest time stamp that is read [s]: in seconds, one of the year 5138."""
+PERIODS = (1e-4, 10.0)
+"""Shortest and longest time between samples [s]."""
+
+
 @dataclass(frozen=True)
 class ImportConfig:
     """How recordings become interactions."""
@@ -72,10 +79,15 @@ class ImportConfig:
     def __post_init__(self) -> None:
         check_type("track", self.track, TrackConfig, PerceptionError)
         check_type("path", self.path, ToolPath, PerceptionError)
-        if self.height is not None and not (is_number(self.height) and 0 < self.height < np.inf):
-            raise PerceptionError(f"height is {shown(self.height)}: give a positive number of metres")
-        if self.start is not None and not np.isfinite(self.start):
-            raise PerceptionError(f"start = {self.start}: give a time stamp of the recording in seconds")
+        check_choices(PerceptionError, self)
+        check_ranges(PerceptionError, "import", self, {"sample_period": PERIODS}, "give seconds")
+        if self.height is not None:
+            check_height(self.height)
+        if self.start is not None:
+            limits = {"start": (-LATEST, LATEST)}
+            check_ranges(
+                PerceptionError, "import", self, limits, "give a time stamp of the recording in seconds"
+            )
 
 
 @dataclass(frozen=True)

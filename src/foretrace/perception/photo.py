@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from foretrace.errors import PerceptionError, is_number, is_whole, shown
+from foretrace.errors import PerceptionError, check_choices, is_whole, shown
 from foretrace.geometry import invert_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.recording_folder import CAMERA, MARKERS, read_depth, read_image
@@ -22,7 +22,14 @@ from foretrace.perception import masks
 from foretrace.perception.markers import LEAST_SLANT, MarkerLayout, align_patterns, detect_markers
 from foretrace.perception.overlay import PREDICTED, draw_overlay
 from foretrace.perception.tracking import still_pose
-from foretrace.perception.views import Observation, contact_at_pixel, observe, place_object, view_of_depth
+from foretrace.perception.views import (
+    Observation,
+    check_height,
+    contact_at_pixel,
+    observe,
+    place_object,
+    view_of_depth,
+)
 
 MaskMethod = Literal["background", "threshold", "colour", "grabcut", "depth"]
 Mask = Bool[np.ndarray, "rows columns"] | Float[np.ndarray, "rows columns"]
@@ -47,14 +54,15 @@ class PhotoConfig:
     """The object's top is level; otherwise the view has the heights of the depth image."""
 
     def __post_init__(self) -> None:
+        check_choices(PerceptionError, self)
         if self.mask is not None and self.mask not in get_args(MaskMethod):
             raise PerceptionError(
                 f"mask is {shown(self.mask)}: choose from {', '.join(get_args(MaskMethod))}"
             )
         if self.box is not None and not _is_box(self.box):
             raise PerceptionError(f"box is {shown(self.box)}: give column, row, width and height in pixels")
-        if self.height is not None and not (is_number(self.height) and 0 < self.height < np.inf):
-            raise PerceptionError(f"height is {shown(self.height)}: give a positive number of metres")
+        if self.height is not None:
+            check_height(self.height)
 
 
 def _is_box(box: object) -> bool:

@@ -7,6 +7,7 @@ height of the nominal bevel.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
 from foretrace.actions import LeverUp
-from foretrace.errors import ActionError, PerceptionError, ShapeError
+from foretrace.errors import ActionError, PerceptionError, ShapeError, fault, is_number, shown
 from foretrace.geometry import convex_hull, invert_transform, planar_transform, transform_points
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import TopDownView
@@ -31,6 +32,8 @@ BLUNTED = 3.0
 """Length that a lens may take from a right-angled corner [pixel]."""
 SMOOTHING = 1.0
 """Standard deviation by which the steps of a mask's border are smoothed [pixel]."""
+HIGHEST = 10.0
+"""Greatest height of an object [m]."""
 LARGEST_OBJECT = 1.0
 """No object is larger than this [m]."""
 
@@ -71,6 +74,18 @@ class Observation:
         """Centre of mass of the object at rest, uniform density assumed, in the action frame [m]."""
         com = self.placed.object.mass_properties(1.0).com
         return transform_points(self.action.T_action_object, com[None])[0]
+
+
+def check_height(height: Any) -> None:
+    """Refuse what is no height of an object [m].
+
+    Raises:
+        PerceptionError: It is no number, or not above 0 and at most `HIGHEST`.
+    """
+    if not (is_number(height) and 0 < height <= HIGHEST):
+        raise fault(PerceptionError, is_number(height))(
+            f"height is {shown(height)}: give metres, above 0 and at most {HIGHEST:g}"
+        )
 
 
 def place_object(

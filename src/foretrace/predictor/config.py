@@ -17,6 +17,8 @@ Device = Literal["auto", "cpu", "cuda"]
 """Where to compute."""
 TrainingPrecision = Literal["auto", "float32", "bfloat16"]
 """Number format of convolutions in training."""
+FASTEST = 1000.0
+"""Highest learning rate."""
 
 
 def check_count(name: str, value: Any, most: int, least: int = 1) -> None:
@@ -103,8 +105,10 @@ class TrainConfig:
         if self.threads is not None:
             check_count("threads", self.threads, 1024)
         rate = self.learning_rate
-        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < math.inf:
-            raise TrainingError(f"learning_rate is {shown(rate)}: give a finite number above 0")
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate <= FASTEST:
+            raise TrainingError(
+                f"learning_rate is {shown(rate)}: give a number above 0 and at most {FASTEST:g}"
+            )
         if self.outcomes is not None:
             check_outcomes(self.outcomes)
         if self.split is not None:

@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float, UInt8
 
 from foretrace.actions import LeverUp, Motion
-from foretrace.errors import SimulationError, check_ranges, check_type, shown
+from foretrace.errors import SimulationError, check_choices, check_ranges, check_type, shown
 from foretrace.files import write_json
 from foretrace.geometry import (
     invert_transform,
@@ -60,6 +60,8 @@ RANGES = {
     "tail_time": (-60.0, 60.0),
     "exposures": (1, 100),
     "depth_every": (0, 1_000_000),
+    "table_side": (0.001, 1.0),
+    "largest_side": (0.001, 1.0),
 }
 """What can be recorded."""
 WITHIN = "beyond, images do not fit into memory, or the camera is below the table or in the object"
@@ -111,6 +113,7 @@ class RecordingConfig:
             raise SimulationError(f"engine {shown(self.simulation.engine)} cannot record: take mujoco")
         check_ranges(SimulationError, "film", self.camera, WIDTH_RANGE, WITHIN)
         check_ranges(SimulationError, "film", self, RANGES, WITHIN)
+        check_choices(SimulationError, self)
 
 
 @dataclass(frozen=True)
