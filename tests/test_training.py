@@ -321,8 +321,11 @@ def test_a_missing_cuda_device_is_refused(tmp_path, batch, monkeypatch):
 
 
 def test_a_diverging_training_is_stopped(tmp_path, batch):
-    with pytest.raises(TrainingError, match=r"loss is (nan|inf)"):
-        train(batch, tmp_path / "run", replace(SMALL, learning_rate=1e30))
+    fast = replace(SMALL, epochs=20, learning_rate=1000.0)
+    with pytest.raises(
+        TrainingError, match=r"loss is (nan|inf) in epoch \d+: lower the learning rate of 1000"
+    ):
+        train(batch, tmp_path / "run", fast, OneShotConfig(features="outline", hidden=8))
 
 
 def test_only_the_chosen_outcomes_are_split(tmp_path, batch):
