@@ -11,10 +11,10 @@ from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
-from foretrace.features.hull import MAX_CORNERS
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import FLOOR, LEVELS, Futures, quantiles_of
+from foretrace.interactions.hull import MAX_CORNERS
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism

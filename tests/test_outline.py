@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from foretrace.actions import LeverUp
 from foretrace.errors import PredictionError
 from foretrace.features import Outline
-from foretrace.features.hull import MAX_CORNERS, fit_hull
 from foretrace.geometry import convex_hull, is_convex, polygon_area
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS, fit_hull
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import sample_prism
 

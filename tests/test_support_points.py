@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from factories import fake_batch
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import FitPart, make_features, support_point_accuracy, support_points
-from foretrace.features.hull import approximate_corners
 from foretrace.features.support_points import (
     UNIT,
     RayFrame,
@@ -20,6 +19,7 @@ from foretrace.features.support_points import (
     points_of,
     support_points_by_rule,
 )
+from foretrace.interactions.hull import approximate_corners
 
 EPOCHS = 150
 

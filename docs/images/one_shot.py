@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
 
 from foretrace.actions import LeverUp
-from foretrace.features.hull import fit_hull
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
+from foretrace.interactions.hull import fit_hull
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import Prism
 from foretrace.pictures.style import INK, OBJECT_COLOR, OBJECT_EDGE, STYLE, TOOL_COLOR

@@ -7,9 +7,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from foretrace.features.base import UNIT, FeatureExtractor
-from foretrace.features.hull import MAX_CORNERS, fit_hull, mask_of
 from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS, fit_hull, mask_of
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 
 HEIGHT_CELLS = 32

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features.base import FeatureExtractor
-from foretrace.features.hull import mask_contour
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.hull import mask_contour
 
 NUM_POINTS = 500
 """Points sampled along an outline."""

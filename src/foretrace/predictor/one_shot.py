@@ -12,10 +12,10 @@ from torch import Tensor
 from foretrace.errors import TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
-from foretrace.features.hull import MAX_CORNERS
 from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.imagined import LEVELS, Futures, ImaginedBatch, conformal_scores, quantiles_of
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.config import (
     PredictorConfig,

@@ -9,11 +9,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from foretrace.features.base import UNIT
-from foretrace.features.hull import MAX_CORNERS
 from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.geometry import quaternion_to_matrix, rotation_from_6d
 from foretrace.imagined import FLOOR, LEVELS
 from foretrace.imagined.context import CONTEXT
+from foretrace.interactions.hull import MAX_CORNERS
 from foretrace.predictor.states import decode_poses, rest_states
 
 if TYPE_CHECKING:
