@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from foretrace.interactions.dataset import Dataset, InteractionBatch
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
-    from foretrace.objects import Bevel, Box, Cylinder, MeshObject, Prism, paper_objects, sample_prism
+    from foretrace.objects import (
+        Bevel,
+        Box,
+        Cylinder,
+        MeshObject,
+        Prism,
+        Weighted,
+        paper_objects,
+        sample_prism,
+    )
     from foretrace.predictor import (
         EffectPredictor,
         LstmConfig,
@@ -36,7 +45,10 @@ _HOMES = {
     "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
-    "foretrace.objects": ("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "paper_objects", "sample_prism"),
+    "foretrace.objects": (
+        *("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "Weighted"),
+        *("paper_objects", "sample_prism"),
+    ),
     "foretrace.features": ("FeatureExtractor",),
     "foretrace.predictor": (
         *(
@@ -80,6 +92,7 @@ __all__ = [
     "ToolPath",
     "TopDownView",
     "TrainConfig",
+    "Weighted",
     "collect",
     "load_predictor",
     "paper_objects",

@@ -10,7 +10,7 @@ from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.cli.parsing import adapt
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
-from foretrace.simulation.randomisation import NOTHING, RANDOMISED, VARIED_ACTION
+from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED, VARIED_ACTION
 
 ROLLING_TIME = 1.5
 """Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
@@ -23,6 +23,8 @@ def simulate(
     watch_time: float | None = None,
     randomise: bool = False,
     vary_action: bool = False,
+    off_centre: bool = False,
+    exact_share: float = 0.0,
     workers: int | None = None,
 ) -> None:
     """Simulate lever-ups of many objects into a data set.
@@ -38,6 +40,8 @@ def simulate(
         randomise: Draw friction, density, thickness and bevel anew for every lever-up, and offset the blade in place
             and direction. Objects and commanded contacts stay the same.
         vary_action: Draw insertion, arc and speed of the blade anew for every lever-up.
+        exact_share: Share of the lever-ups whose contact is as commanded, with --randomise.
+        off_centre: Move the centre of mass of half the prisms and boxes away from the middle.
         workers: Number of processes; by default one for each core.
     """
     if watch_time is None:
@@ -45,6 +49,10 @@ def simulate(
     randomisation = RANDOMISED if randomise else NOTHING
     if vary_action:
         randomisation = replace(randomisation, **VARIED_ACTION)
+    if exact_share:
+        randomisation = replace(randomisation, execution_share=1 - exact_share)
+    if off_centre:
+        randomisation = replace(randomisation, com_offset=LARGEST_COM_OFFSET)
     simulation = replace(config.simulation, watch_time=watch_time)
     config = replace(config, simulation=simulation, randomisation=randomisation)
     with when_interrupted(f"what is done stays in {out}, the same command goes on from there"):

@@ -213,6 +213,7 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
     corners = _corners_in_action(table, objects)
     slip_index = table["slip_index"].to_numpy()
     constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
+    constants["contact_error"] = _contact_errors(table)
     return InteractionBatch(
         ids=table["id"].to_numpy(),
         mask=storage.unpack_masks(table["mask"].to_pylist()),
@@ -229,6 +230,13 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
         outcome=_outcome_array(table["outcome"].to_pylist()),
         parameters=constants | storage.parameter_values(table),
     )
+
+
+def _contact_errors(table: pa.Table) -> Float[np.ndarray, " batch"]:
+    """Distances of executed contacts from commanded ones [m]; NaN for recordings, where they were not measured."""
+    ahead, left = (table[storage.EXECUTION + name].to_numpy().astype(float) for name in ("ahead", "left"))
+    simulated = np.array([source == "simulated" for source in table["source"].to_pylist()], dtype=bool)
+    return np.where(simulated, np.hypot(ahead, left), np.nan)
 
 
 def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:

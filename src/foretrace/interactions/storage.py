@@ -114,7 +114,7 @@ COLUMNS: dict[str, tuple[pa.DataType, str, str]] = {
     "source": (pa.string(), "", "simulated or recorded"),
     "engine": (pa.string(), "", "physics engine, empty for a recording"),
     "embodiment": (pa.string(), "", "arm or tool"),
-    "camera": (pa.string(), "", "how the view was made: exact, rgbd or recorded"),
+    "camera": (pa.string(), "", "how the view was made: exact, grid, rgbd or recorded"),
     "seed": (pa.int64(), "", "seed of this interaction's random draws"),
     "timestep": (pa.float64(), "s", "time step of the simulation, 0 for a recording"),
     "sample_period": (pa.float64(), "s", "time between samples"),

@@ -31,6 +31,7 @@ from foretrace.objects.solid import (
     sample_cylinder,
     sample_look_alikes,
 )
+from foretrace.objects.weighted import Weighted
 
 __all__ = [
     "BEVEL",
@@ -48,6 +49,7 @@ __all__ = [
     "MeshObject",
     "ObjectModel",
     "Prism",
+    "Weighted",
     "look_alikes",
     "object_from_dict",
     "object_from_json",

@@ -96,7 +96,7 @@ OBJECTS: Registry[type["ObjectModel"]] = Registry("object", "foretrace.objects",
 
 
 class ObjectModel(ABC):
-    """A rigid object of uniform density at rest on the table.
+    """A rigid object at rest on the table, of uniform density unless it is `Weighted`.
 
     The object frame is the one its corners are given in; z points up and z = 0 is the table side.
     Objects are frozen and their arrays read-only. A subclass registers itself by its kind.
@@ -116,6 +116,11 @@ class ObjectModel(ABC):
     def collision_shapes(self) -> list[CollisionShape]:
         """The object's parts as a physics engine should collide them: hulls, or true cylinders."""
         return [HullShape(vertices) for vertices in self.convex_pieces()]
+
+    @property
+    def shape(self) -> "ObjectModel":
+        """The object of the same shape and of uniform density: what pictures show."""
+        return self
 
     @property
     def is_round(self) -> bool:

@@ -22,6 +22,7 @@ def faces_of(obj: ObjectModel, every: int = 1) -> list[Float[np.ndarray, "_ 3"]]
         obj: The object.
         every: Of a cylinder's 64 facets one is made of so many.
     """
+    obj = obj.shape
     if isinstance(obj, MeshObject):
         return list(obj.vertices[obj.faces])
     if isinstance(obj, Cylinder):
@@ -41,6 +42,7 @@ def triangles_of(obj: ObjectModel) -> tuple[Float[np.ndarray, "v 3"], Int[np.nda
     Returns:
         Vertices in the object frame [m], and the indices of each triangle's corners, counter-clockwise from outside.
     """
+    obj = obj.shape
     if isinstance(obj, MeshObject):
         return obj.vertices, obj.faces
     layers = np.split(obj.convex_pieces()[0], 2) if isinstance(obj, Cylinder) else _layers(obj)

@@ -138,7 +138,7 @@ def _draw_stage(ax: Axes, scene: Scene, k: int) -> None:
         faces += [(face, _shaded(TOOL_COLOR, face)) for face in blade]
     faces.sort(key=lambda face: project(face[0])[:, 2].mean())  # the far ones first
     polygons, colors = [project(face)[:, :2] * CM for face, _ in faces], [color for _, color in faces]
-    edges = colors if isinstance(scene.obj, MeshObject) else OBJECT_EDGE  # no triangles on meshes
+    edges = colors if isinstance(scene.obj.shape, MeshObject) else OBJECT_EDGE  # no triangles on meshes
     ax.add_collection(PolyCollection(polygons, facecolors=colors, edgecolors=edges, linewidths=0.9, zorder=2))
     if scene.support_points is not None:
         at_rest = np.column_stack([scene.support_points, np.zeros(2)])

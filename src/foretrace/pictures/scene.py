@@ -305,7 +305,7 @@ def draw_over_time(axes: list[Axes], scene: Scene) -> None:
 
 def silhouette(obj: ObjectModel, pose: Float[np.ndarray, "7"]) -> list[Float[np.ndarray, "_ 2"]]:
     """Outlines of an object seen from the side: closed rings of x and z in the action frame [m]."""
-    transform = pose_to_matrix(pose)
+    obj, transform = obj.shape, pose_to_matrix(pose)
     if isinstance(obj, MeshObject):
         return obj.side_view(transform)
     hulls = [

@@ -33,11 +33,15 @@ from foretrace.interactions.record import (
     Physics,
     Provenance,
 )
-from foretrace.interactions.topdown import TopDownView
+from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.simulation.engine import make_engine
 
-CAMERAS = ("exact", "rgbd")
+CAMERAS = ("exact", "grid", "rgbd")
+"""``exact``: pixels aligned with the action. ``grid``: pixels that lie and are turned at random, as those of a camera
+are, brought into the action's frame. ``rgbd``: a rendered depth image."""
+GRID_STREAM = 4
+"""Tells the random numbers of pixel grids from others of the same seed."""
 LARGEST_SEED = 2**63 - 1
 SHORTEST, LONGEST = 1e-5, 1.0
 """Limits of time steps and sample periods [s]."""
@@ -57,7 +61,7 @@ class SimulationConfig:
     embodiment: str = "arm"
     """``arm``: the whole robot; ``tool``: the tool alone on the same path."""
     camera: str = "exact"
-    """``exact``: the view from geometry; ``rgbd``: from a rendered depth image."""
+    """``exact``: the view from geometry; ``grid``: the same on turned pixels; ``rgbd``: from a rendered depth image."""
     timestep: float = 0.002
     """Time step [s]."""
     sample_period: float = 0.05
@@ -131,6 +135,8 @@ def simulate_lever_up(
     engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
     if config.camera == "exact":
         view = TopDownView.of(obj, action)
+    elif config.camera == "grid":
+        view = view_on_grid(obj, action, seed)
     else:
         # Loads OpenGL, which the exact camera does without.
         from foretrace.simulation.camera import take_rgbd
@@ -146,6 +152,29 @@ def simulate_lever_up(
     made = {name: getattr(config, name) for name in SETTINGS}
     provenance = Provenance(seed=seed, versions=versions_of("foretrace", "numpy", engine.library), **made)
     return Interaction(obj, action, view, effect, config.physics, provenance, execution_error, id)
+
+
+def view_on_grid(obj: ObjectModel, action: Action, seed: int) -> TopDownView:
+    """The view of an object whose mask was seen on a grid of pixels of its own, turned and shifted at random.
+
+    Args:
+        obj: The object.
+        action: The action, in whose frame the view is.
+        seed: Seed of the grid's place.
+
+    Raises:
+        ViewError: The object does not fit into the window.
+    """
+    rng = np.random.default_rng([seed, GRID_STREAM])
+    turn = rng.uniform(0, 2 * np.pi)
+    direction = np.array([np.cos(turn), np.sin(turn)])
+    low, high = obj.corners.min(axis=0), obj.corners.max(axis=0)
+    middle = (low + high) / 2 + METRES_PER_PIXEL * rng.uniform(-0.5, 0.5, 2)
+    # Its window reaches from 0.1 m behind the contact point to 0.3 m ahead: the object is put into the middle.
+    grid = replace(action, contact=middle - 0.1 * direction, direction=direction)
+    T_grid_action = grid.T_action_object @ invert_transform(action.T_action_object)
+    here = replace(action, contact=T_grid_action[:2, 3], direction=T_grid_action[:2, 0])
+    return TopDownView.of(obj, grid).seen_from(here)
 
 
 SETTINGS = ("engine", "embodiment", "camera", "timestep", "sample_period", "watch_time")
@@ -173,7 +202,7 @@ def simulate(
         action: A `LeverUp` or another action.
         engine: Physics engine.
         embodiment: ``arm``: the whole robot; ``tool``: the tool alone on the same path.
-        camera: ``exact``: the view from geometry; ``rgbd``: from a rendered depth image.
+        camera: ``exact``: the view from geometry; ``grid``: on turned pixels; ``rgbd``: from a rendered depth image.
         seed: Seed of the interaction's random draws (camera noise); the physics draws nothing.
         physics: Friction and density, if not the nominal ones.
         timestep: Time step [s].

@@ -11,7 +11,8 @@ import numpy as np
 from foretrace.actions import CONTACT_TOLERANCE, ToolPath
 from foretrace.errors import SimulationError, check_ranges, is_number, shown, wrong_type
 from foretrace.interactions.record import ExecutionOffset, Physics
-from foretrace.objects import Bevel, Box, ObjectModel, Prism
+from foretrace.objects import Bevel, Box, ObjectModel, Prism, Weighted
+from foretrace.objects.model import inner_radius
 
 Range = tuple[float, float]
 """Least and greatest value of what is drawn uniformly."""
@@ -59,6 +60,11 @@ class Randomisation:
     """Angles of that arc [rad]."""
     speed: Range | None = None
     """Multiples of the configured speed. The blade rests at the end until the slowest one would be there, too."""
+    com_offset: float | None = None
+    """Largest offset of the centre of mass of prisms and boxes, as a share of the radius of the widest circle inside
+    the outline. Half of the objects stay uniform, as all do with None."""
+    execution_share: float | None = None
+    """Share of the lever-ups that have an execution error; None: all."""
 
     def __post_init__(self) -> None:
         for name in RANGES:
@@ -76,6 +82,10 @@ class Randomisation:
                     "give a least one above 0 and a greatest one"
                 )
         limits = {name: (0.0, limit) for name, limit in LARGEST.items()}
+        if self.com_offset is not None:
+            limits["com_offset"] = (0.0, 0.5)
+        if self.execution_share is not None:
+            limits["execution_share"] = (0.0, 1.0)
         check_ranges(SimulationError, "randomisation", self, limits)
 
     def vary(
@@ -93,6 +103,8 @@ class Randomisation:
             ShapeError: A thinner object or a wider bevel leaves no bottom face.
             ActionError: No path goes so deep, so far or so fast.
         """
+        # Numbers of its own, which do not move those of other settings.
+        (own,) = rng.spawn(1)
         shares = dict(zip((field.name for field in fields(self)), rng.random(len(fields(self))), strict=True))
         drawn = {
             name: float(limits[0] + shares[name] * (limits[1] - limits[0]))
@@ -100,13 +112,18 @@ class Randomisation:
             if (limits := getattr(self, name)) is not None
         }
         ahead, left, turn = (float(getattr(self, name) * (2 * shares[name] - 1)) for name in LARGEST)
+        if self.execution_share is not None and shares["execution_share"] >= self.execution_share:
+            ahead = left = turn = 0.0
         constants = {name: drawn[name] for name in CONSTANTS if name in drawn}
         factors = [drawn.get(name, 1.0) for name in FACTORS]
         path = replace(path, **{name: drawn[name] for name in PATH if name in drawn})
         if self.speed is not None:
             path = _sped_up(path, drawn["speed"], slowest=self.speed[0])
+        varied = reshaped(obj, *factors)
+        if self.com_offset is not None:
+            varied = off_centre(varied, self.com_offset * max(0.0, 2 * shares["com_offset"] - 1), own)
         return (
-            reshaped(obj, *factors),
+            varied,
             replace(physics, **constants),
             path,
             ExecutionOffset(ahead, left, turn),
@@ -151,12 +168,18 @@ VARIED_ACTION = {
 """What ``foretrace simulate --vary-action`` draws from: around the nominal path, within the arm's reach and speed."""
 
 
+LARGEST_COM_OFFSET = 1 / 3
+"""What ``foretrace simulate --off-centre`` draws up to, as a share of the inner radius."""
+
+
 def reshaped(obj: ObjectModel, thickness: float, bevel_width: float, bevel_height: float) -> ObjectModel:
     """A prism or box of another height and bevel, by factors; any other object as it is.
 
     Raises:
         ShapeError: Too thin for its bevel, or no bottom face is left.
     """
+    if isinstance(obj, Weighted):
+        return Weighted(reshaped(obj.object, thickness, bevel_width, bevel_height), obj.com_offset)
     if not isinstance(obj, Prism) or (thickness, bevel_width, bevel_height) == (1.0, 1.0, 1.0):
         return obj
     height = thickness * obj.height
@@ -164,3 +187,17 @@ def reshaped(obj: ObjectModel, thickness: float, bevel_width: float, bevel_heigh
     if isinstance(obj, Box):
         return Box(obj.width, obj.depth, height, bevel)
     return Prism(obj.corners, height, bevel)
+
+
+def off_centre(obj: ObjectModel, share: float, rng: np.random.Generator) -> ObjectModel:
+    """A prism or box whose centre of mass lies off, in any direction; any other object as it is.
+
+    Args:
+        obj: The object.
+        share: Distance as a share of the radius of the widest circle inside the outline.
+        rng: Draws the direction.
+    """
+    if not isinstance(obj, Prism) or share == 0:
+        return obj
+    angle = rng.uniform(0, 2 * np.pi)
+    return Weighted(obj, share * inner_radius(obj.corners) * np.array([np.cos(angle), np.sin(angle)]))
