@@ -140,7 +140,7 @@ def carry_out(
 
 
 def trials(part: str, options: Options, materials: Path) -> list[Row]:
-    """All trials of a part, in an order in which any beginning is a fair sample."""
+    """All trials of a part, in an order in which any beginning is a fair sample; commands that take long are last."""
     if part == "writes":
         with Server(materials) as server:
             for name in writes.JOBS:
@@ -165,7 +165,7 @@ def trials(part: str, options: Options, materials: Path) -> list[Row]:
             trial for block, n in counts for trial in drawn(strategy, 1_000_000 * options.seed + block, n)
         ]
     random.Random(options.seed).shuffle(found)
-    return found
+    return sorted(found, key=lambda trial: part == "writes" and writes.JOBS[trial["job"]].slow)
 
 
 def run(batch: list[Row], server: Server, materials: Path) -> list[Outcome]:
