@@ -3,7 +3,12 @@
 Every trial is described by a few plain values, so that it can be repeated alone, and ends in one `Outcome`.
 """
 
+import ctypes
+import signal
+import sys
 from dataclasses import dataclass
+
+from foretrace.workers import PR_SET_PDEATHSIG
 
 OK, REFUSED, FAULT = "ok", "refused", "fault"
 
@@ -29,3 +34,9 @@ def one_line(message: str) -> str | None:
     if len(message) > 600:
         return f"{len(message)} characters"
     return None if message.strip() else "an empty message"
+
+
+def end_with_parent() -> None:
+    """Have the kernel end this process with its parent, such as a campaign that is interrupted."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -23,7 +23,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from campaign import FAULT, Outcome
+from campaign import FAULT, Outcome, end_with_parent
 from campaign.answers import leak
 
 TIME_LIMIT, MEMORY_LIMIT = 20.0, 2000.0
@@ -126,6 +126,7 @@ def _forked(trial: Trial, requests: Sequence[Request], materials: Path, limit: f
 
 
 def _in_child(trial: Trial, requests: Sequence[Request], folder: Path, materials: Path, answers: int) -> None:
+    end_with_parent()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, resource.getrlimit(resource.RLIMIT_AS)[1]))
     for number, request in enumerate(requests):

@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from campaign import FAULT, OK, REFUSED, Outcome, one_line
+from campaign import FAULT, OK, REFUSED, Outcome, end_with_parent, one_line
 
 STOP, HALF, FULL = "stop", "half", "full"
 WAYS = (STOP, HALF, FULL)
@@ -219,6 +219,7 @@ def _in_fork(name: str, folder: Path, materials: Path, crash: tuple[int, str] | 
     child = os.fork()
     if child == 0:
         status = 70
+        end_with_parent()
         try:
             said = os.open(folder.parent / "said", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
             os.dup2(said, 2)
