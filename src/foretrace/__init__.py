@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig, replay, simulate, simulate_lever_up
+    from foretrace.twin import TwinConfig, TwinImaginer
 
 __version__ = "0.1.0"
 
@@ -63,6 +64,7 @@ _HOMES = {
     ),
     "foretrace.simulation.collect": ("CollectConfig", "collect"),
     "foretrace.simulation.lever_up": ("SimulationConfig", "replay", "simulate", "simulate_lever_up"),
+    "foretrace.twin": ("TwinConfig", "TwinImaginer"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -92,6 +94,8 @@ __all__ = [
     "ToolPath",
     "TopDownView",
     "TrainConfig",
+    "TwinConfig",
+    "TwinImaginer",
     "Weighted",
     "collect",
     "load_predictor",

@@ -265,4 +265,6 @@ def match_corners(model: ObjectModel, corners: Float[np.ndarray, "n 2"]) -> Seen
     turn = planar_transform([0.0, 0.0], float(angle))[:2, :2]
     if np.abs(a @ turn.T - b).max() > METRES_PER_PIXEL / VIEW_SIZE:
         return None
-    return SeenObject(model, planar_transform([*(corners.mean(axis=0) - turn @ own.mean(axis=0)), 0.0], float(angle)))
+    return SeenObject(
+        model, planar_transform([*(corners.mean(axis=0) - turn @ own.mean(axis=0)), 0.0], float(angle))
+    )
