@@ -83,6 +83,8 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
                               "subjects": (PENTAGON_EDGE, replace(PENTAGON_EDGE, group="everyday", hull=True))},
     "non-flat": lambda root: {"data": root / "solids", "seeds": (0,), "splits": ("by-outline",), "probes": 1,
                               "recipe": QUICK["lstm"].change(features="im-cnn")},
+    "twin": lambda root: {"data": root / "plain", "everyday": root / "solids", "parts": ("shuffled", "not-flat"),
+                          "imaginers": ("twin", "one-shot"), "proportional": True, "recipe": QUICK["one-shot"]},
     "uncertainty": lambda root: {"data": root / "plain", "seeds": (0,), "splits": ("shuffled",), "samples": 3,
                                  "recipe": QUICK["one-shot"]},
 }  # fmt: skip

@@ -33,6 +33,7 @@ SUMMARIES = {
     "reconstruction": "What the codes of autoencoders retain of masks.",
     "replay": "Deviation of simulated motions from recorded ones.",
     "transfer": "Predictions against recordings, or a stand-in for the robot.",
+    "twin": "The twin, which simulates what it sees, beside what is learned.",
     "non-flat": "Masks against height maps of objects that are not flat.",
     "uncertainty": "Calibration of probabilities, regions and samples.",
 }

@@ -21,6 +21,8 @@ CLEARLY = 0.15
 """A pixel contradicts an outline if its centre lies on the wrong side, and further from it than this [pixels]."""
 FEW = 3
 """An outline with straight sides may contradict this many pixels."""
+FRAYED = 2
+"""In a noisy mask, it may contradict so many times as many as the level line, which follows some of the noise."""
 MOST_SIDES = 11
 """An outline of more sides is taken to be curved."""
 BLUR = 1.0
@@ -112,10 +114,13 @@ def fit_outline(mask: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "n 
     and its outline is the level line of the blurred mask.
     """
     straight = fit_hull(mask)
-    if 3 <= len(straight) <= MOST_SIDES and count_contradictions(straight, mask) <= FEW:
+    wrong = count_contradictions(straight, mask) if 3 <= len(straight) <= MOST_SIDES else np.inf
+    if wrong <= FEW:
         return straight
     curved = _level_line(mask)
-    return straight if curved is None else curved
+    if curved is None or wrong <= FEW + FRAYED * count_contradictions(curved, mask):
+        return straight
+    return curved
 
 
 def count_contradictions(corners: Float[np.ndarray, "n 2"], mask: Bool[np.ndarray, "rows columns"]) -> int:
