@@ -179,9 +179,8 @@ def test_options_that_do_not_fit_are_refused(options: dict, message: str, tmp_pa
 )
 def test_an_unusual_size_is_pointed_out(scale: float, size: str, likelier: str, tmp_path: Path) -> None:
     Image.fromarray(np.pad(np.ones((90, 90), np.uint8), 9)).save(tmp_path / "mask.png")
-    with pytest.warns(
-        UserWarning, match=f"{size} cm long, check --scale: {likelier} m per pixel in place of"
-    ):
+    message = rf"{size} cm long, check --scale \(metres_per_pixel\): {likelier} m per pixel in place of"
+    with pytest.warns(UserWarning, match=message):
         ObjectOptions(image=tmp_path / "mask.png", scale=scale).load()
 
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,11 @@ import numpy as np
 import pytest
 
 from foretrace.cli import main
-from foretrace.errors import PerceptionError
+from foretrace.errors import PerceptionError, ViewError
 from foretrace.geometry import invert_transform, transform_points
 from foretrace.interactions.recording_folder import read_depth, read_image
 from foretrace.interactions.topdown import TopDownView
-from foretrace.perception.markers import MarkerLayout
+from foretrace.perception.markers import MarkerBody, MarkerLayout
 from foretrace.perception.photo import PhotoConfig, PhotoView, observe_photo, open_photo
 from foretrace.simulation.recording import RecordingTruth
 from recorded_scene import ACTION, CAMERA, PRISM, contact_pixel
@@ -258,3 +259,23 @@ def test_a_photograph_taken_too_flat_is_refused_as_that(recorded: Recorded, imag
         PerceptionError, match="from 10 degrees above the table, 15 are needed: take it from higher"
     ):
         observe_photo(images["image"], CAMERA, middle, T_table_camera=flat, background=images["background"])
+
+
+def test_markers_of_another_size_than_stated_are_pointed_out(recorded: Recorded, images: dict) -> None:
+    def seen(times: float) -> PhotoView:
+        body = images["layout"].table
+        farther = np.array([[1, 1, 1, times]] * 3 + [[1, 1, 1, 1]])
+        poses = {id: farther * pose for id, pose in body.placements.items()}
+        table = MarkerBody({id: times * side for id, side in body.sides.items()}, poses)
+        here = (images["image"], CAMERA, contact_pixel(recorded[1]))
+        layout = replace(images["layout"], table=table)
+        return observe_photo(*here, layout=layout, background=images["background"])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert seen(1.0).placed.object.size == pytest.approx(PRISM.size, abs=0.004)
+    told = r"the object is 5\d\.?\d? cm long on the table: check the sides of the markers as printed"
+    with pytest.warns(UserWarning, match=told), pytest.raises(ViewError, match="check the scale"):
+        seen(3.0)
+    with pytest.raises(PerceptionError, match=r"over a metre of table: .*; check the sides of the markers"):
+        seen(10.0)

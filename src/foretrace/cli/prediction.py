@@ -1,6 +1,5 @@
 """The command that predicts the motion of an object."""
 
-import warnings
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,7 +57,6 @@ class ObjectOptions:
         from foretrace.objects.polygon_files import read_polygon
         from foretrace.objects.prism import DEFAULT_HEIGHT
         from foretrace.objects.shape_files import read_silhouette_image
-        from foretrace.objects.silhouette import likelier_scale
 
         given = [f"--{name}" for name in ("polygon", "image", "mesh") if getattr(self, name) is not None]
         if len(given) != 1:
@@ -83,12 +81,7 @@ class ObjectOptions:
         if self.scale is None or self.image is None:
             raise PredictionError("--image needs --scale, the metres per pixel")
         mask = read_silhouette_image(self.image, self._label(), self.invert)
-        prism = Prism.from_mask(mask, self.scale, height)
-        if (likelier := likelier_scale(prism.size, self.scale)) is not None:
-            warnings.warn(
-                f"the object is {100 * prism.size:.3g} cm long, check --scale: {likelier}", stacklevel=1
-            )
-        return prism, mask
+        return Prism.from_mask(mask, self.scale, height), mask
 
     def _label(self) -> "list[float] | None":
         """The label as numbers."""

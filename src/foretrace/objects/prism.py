@@ -1,5 +1,6 @@
 """Prisms: an outline drawn on the table and extruded, with a bevelled lower rim."""
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -124,6 +125,11 @@ class Prism(ObjectModel):
         size = largest_distance(corners)
         likelier = likelier_scale(size, metres_per_pixel)
         check_size(size, height, "check unit (metres) or scale" + (f": {likelier}" if likelier else ""))
+        if likelier is not None:
+            warnings.warn(
+                f"the object is {100 * size:.3g} cm long, check --scale (metres_per_pixel): {likelier}",
+                stacklevel=2,
+            )
         return cls(corners, height, bevel or fitting_bevel(corners, height))
 
     def convex_pieces(self) -> list[Float[np.ndarray, "_ 3"]]:

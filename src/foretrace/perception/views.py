@@ -6,6 +6,7 @@ That is exact for convex outlines. What is assumed: vertical sides, the height t
 height of the nominal bevel.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,8 @@ from foretrace.geometry import convex_hull, invert_transform, planar_transform, 
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import BEVEL, ObjectModel, Prism, read_silhouette, silhouette_origin
+from foretrace.objects.model import USUAL_SIZES, check_size, fitting_bevel, largest_distance
+from foretrace.objects.silhouette import silhouette_polygon
 from foretrace.perception.masks import DEPTH_RIM
 from foretrace.perception.shadows import filled
 
@@ -36,6 +39,8 @@ HIGHEST = 10.0
 """Greatest height of an object [m]."""
 LARGEST_OBJECT = 1.0
 """No object is larger than this [m]."""
+LENGTHS = "check the sides of the markers as printed, or the unit of the depth image"
+"""What gives the table its scale."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,7 @@ def place_object(
     reach = np.concatenate([camera.on_plane(pixels, T_table_camera, level) for level in (rim, height)])
     if not np.isfinite(reach).all() or np.ptp(reach, axis=0).max() > LARGEST_OBJECT:
         raise PerceptionError(
-            "the mask reaches to the horizon or over a metre of table: check mask and camera pose"
+            f"the mask reaches to the horizon or over a metre of table: check mask and camera pose; {LENGTHS}"
         )
     low, high = reach.min(axis=0) - 4 * GRID, reach.max(axis=0) + 4 * GRID
     size = np.ceil((high - low) / GRID).astype(int)
@@ -131,11 +136,14 @@ def place_object(
     try:
         blunted = BLUNTED * pixel_size(camera, T_table_camera, reach.mean(axis=0))
         flat = filled(flat)
-        prism = Prism.from_mask(flat, GRID, height, tolerance=TOLERANCE, blunted=blunted)
-        if hull:
-            prism = Prism(convex_hull(prism.corners), height, prism.bevel)
+        corners = silhouette_polygon(flat, GRID, TOLERANCE, blunted)
+        check_size(largest_distance(corners), height, LENGTHS)
+        bevel = fitting_bevel(corners, height)
+        prism = Prism(convex_hull(corners) if hull else corners, height, bevel)
     except ShapeError as error:
         raise PerceptionError(f"the mask shows no usable object: {error}") from error
+    if not USUAL_SIZES[0] <= prism.size <= USUAL_SIZES[1]:
+        warnings.warn(f"the object is {100 * prism.size:.3g} cm long on the table: {LENGTHS}", stacklevel=2)
     origin = silhouette_origin(read_silhouette(flat))  # of the largest patch, without holes
     shift = low + GRID * np.array([origin[1] + 0.5, size[1] - 1 - origin[0] + 0.5])
     return PlacedObject(prism, planar_transform(shift, 0.0))
