@@ -26,8 +26,15 @@ with TemporaryDirectory() as folder:
     file = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder, "model.onnx")
     if len(sys.argv) == 1:
         export_onnx(ft.load_predictor(), file)
-    session = onnxruntime.InferenceSession(file)
+    try:
+        session = onnxruntime.InferenceSession(file)
+    except Exception as error:  # onnxruntime's have no class in common
+        sys.exit(
+            f"{file} is no model ({str(error).splitlines()[0]}): give what `foretrace export onnx` wrote"
+        )
 about = session.get_modelmeta().custom_metadata_map
+if "foretrace.config" not in about:
+    sys.exit(f"{file} is no predictor of foretrace: give what `foretrace export onnx` wrote")
 config, context = (json.loads(about[f"foretrace.{name}"]) for name in ("config", "context"))
 x, y = view.to_metres(np.argwhere(view.mask).mean(axis=0)[None])[0]
 usual = asdict(ft.Physics()) | dict(nominal_parameters())

@@ -348,6 +348,27 @@ def test_a_damaged_trial_is_an_error_of_one_line(name: str, value: Any, tmp_path
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("change", ["lost", "other", "trial", "none"])
+def test_a_trial_whose_numbers_are_not_those_that_were_written_is_refused(change: str, tmp_path: Path):
+    run_experiment(Toy((0,)), tmp_path, console=QUIET)
+    (file, *_) = sorted((tmp_path / TRIALS).glob("*.json"))
+    content = json.loads(file.read_text())
+    if change == "lost":
+        del content["rows"][0]["value"]
+    elif change == "other":
+        content["rows"][0]["value"] += 1.0
+    elif change == "trial":
+        content["trial"]["seed"] = 7
+    else:  # as files were written before they had a checksum
+        del content["checksum"]
+    file.write_text(json.dumps(content))
+    if change == "none":
+        assert not run_experiment(Toy((0,)), tmp_path, console=QUIET).rows["value"].isna().any()
+        return
+    with pytest.raises(ResultsError, match=r"differ from what was written: remove it"):
+        run_experiment(Toy((0,)), tmp_path, console=QUIET)
+
+
 def test_what_cannot_be_run_is_refused(tmp_path: Path):
     with pytest.raises(ResultsError, match="takes long and has to keep its results"):
         run_experiment(EXPERIMENTS["paper"]())

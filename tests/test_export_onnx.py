@@ -1,6 +1,8 @@
 import io
 import json
 import re
+import subprocess
+import sys
 from contextlib import redirect_stdout
 
 import numpy as np
@@ -155,6 +157,27 @@ def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
     np.testing.assert_allclose(rotation, quaternion_to_matrix(imagined.pose[..., 3:]), atol=1e-5)
 
     assert "the centre of mass ends at [" in run_python(EXAMPLES / "run_onnx.py", written.path)
+
+
+@pytest.mark.parametrize("content", ["missing", "text", "another model"])
+def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path):
+    file = tmp_path / "model.onnx"
+    if content == "text":
+        file.write_text("hello")
+    elif content == "another model":
+        same = onnx.helper.make_node("Identity", ["x"], ["y"])
+        ports = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in "xy"]
+        graph = onnx.helper.make_graph([same], "same", ports[:1], ports[1:])
+        opset = [onnx.helper.make_opsetid("", 18)]
+        onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), file)
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "run_onnx.py", file], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert re.fullmatch(
+        r".*model\.onnx is no (model \(.+\)|predictor of foretrace): give what .*\n", done.stderr
+    )
+    assert ("is no predictor" in done.stderr) == (content == "another model")
 
 
 @pytest.mark.slow

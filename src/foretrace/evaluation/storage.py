@@ -20,6 +20,7 @@ from foretrace.files import (
     make_folder,
     read_text,
     read_versioned,
+    short_hash,
     write_json,
     write_text,
 )
@@ -41,6 +42,7 @@ class TrialEntries(TypedDict):
     identity: dict[str, Any]
     trial: dict[str, Plain]
     rows: list[dict[str, Plain]]
+    checksum: NotRequired[str]
 
 
 class SummaryEntries(TypedDict):
@@ -83,6 +85,8 @@ class Store:
                 trial = trial_of(self.experiment.trial, content["trial"])
             except (KeyError, ValueError) as reason:
                 raise ResultsError(f"{file}: its trial is none ({shown(reason)}): remove it") from reason
+            if content.get("checksum", wanted := _checksum(content["trial"], content["rows"])) != wanted:
+                raise ResultsError(f"{file}: its rows or its trial differ from what was written: remove it")
             found[trial] = [
                 {name: _value(value) if value in INFINITE else value for name, value in row.items()}
                 for row in content["rows"]
@@ -133,7 +137,8 @@ class Store:
             {name: str(value) if str(value) in INFINITE else value for name, value in row.items()}
             for row in rows
         ]
-        return {**start, "trial": trial.settings, "rows": written}
+        checksum = _checksum(trial.settings, written)
+        return {**start, "trial": trial.settings, "rows": written, "checksum": checksum}
 
     def _check(self, found: Mapping[str, Any]) -> None:
         if difference := first_difference(found, self.identity):
@@ -258,6 +263,11 @@ def plain(row: Mapping[str, Any]) -> dict[str, Plain]:
             )
         kept[name] = str(value) if isinstance(value, str) else value
     return kept
+
+
+def _checksum(trial: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    """A row that has lost an entry cannot be told from one that never had it otherwise."""
+    return short_hash([json.dumps([trial, rows], sort_keys=True).encode()])
 
 
 def _value(text: str) -> Plain:
