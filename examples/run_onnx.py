@@ -23,19 +23,14 @@ action = ft.LeverUp.at_edge(prism, edge=2)
 view = ft.TopDownView.of(prism, action)  # or TopDownView.from_mask, from_points
 
 with TemporaryDirectory() as folder:
-    file = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder, "model.onnx")
-    if len(sys.argv) == 1:
-        export_onnx(ft.load_predictor(), file)
+    own = export_onnx(ft.load_predictor(), Path(folder, "model.onnx")).path if len(sys.argv) == 1 else None
+    file = own or Path(sys.argv[1])
     try:
         session = onnxruntime.InferenceSession(file)
-    except Exception as error:  # onnxruntime's have no class in common
-        sys.exit(
-            f"{file} is no model ({str(error).splitlines()[0]}): give what `foretrace export onnx` wrote"
-        )
-about = session.get_modelmeta().custom_metadata_map
-if "foretrace.config" not in about:
-    sys.exit(f"{file} is no predictor of foretrace: give what `foretrace export onnx` wrote")
-config, context = (json.loads(about[f"foretrace.{name}"]) for name in ("config", "context"))
+        about = session.get_modelmeta().custom_metadata_map
+        config, context = (json.loads(about[f"foretrace.{name}"]) for name in ("config", "context"))
+    except Exception:  # onnxruntime's have no class in common
+        sys.exit(f"{file} is missing or no predictor: give a file that `foretrace export onnx` wrote")
 x, y = view.to_metres(np.argwhere(view.mask).mean(axis=0)[None])[0]
 usual = asdict(ft.Physics()) | dict(nominal_parameters())
 inputs = {
@@ -55,9 +50,8 @@ if "features" in wanted:
         batch = InteractionBatch.from_views([view])
         inputs["features"] = features(features.inputs(batch)).detach().numpy()
 
-names = [each.name for each in session.get_outputs()]
-found = session.run(None, {name: inputs[name] for name in wanted})
-said = dict(zip(names, map(np.asarray, found), strict=True))
+found = map(np.asarray, session.run(None, {name: inputs[name] for name in wanted}))
+said = {each.name: values for each, values in zip(session.get_outputs(), found, strict=True)}
 path = said["com_trajectory"]
 if "probability" in said:  # several futures: the most probable one
     best = said["probability"][0].argmax()
