@@ -40,6 +40,7 @@ from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.stand_in import StandIn
+from foretrace.twin.residual import ResidualConfig
 
 QUIET = Console(quiet=True)
 RECORDINGS = Path(__file__).parents[1] / "examples" / "replay_recording" / "recordings.json"
@@ -57,6 +58,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     factories.fake_data_set(root / "varied", RANDOMISED)
     tool = SimulationConfig(embodiment="tool", watch_time=1.5)
     collect(CollectConfig(9, 1, 0, tool, "solids"), root / "solids", 1, console=QUIET)
+    blade = SimulationConfig(embodiment="tool")
+    collect(CollectConfig(4, 1, 0, blade), root / "blade", 1, console=QUIET)
     from foretrace.interactions.dataset import Dataset
 
     recipe = QUICK["lstm"].change(
@@ -85,6 +88,9 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
                               "recipe": QUICK["lstm"].change(features="im-cnn")},
     "twin": lambda root: {"data": root / "plain", "everyday": root / "solids", "parts": ("shuffled", "not-flat"),
                           "imaginers": ("twin", "one-shot"), "proportional": True, "recipe": QUICK["one-shot"]},
+    "other-world": lambda root: {"data": root / "blade", "lever_ups": (0, 6), "seeds": (0,), "proportional": True,
+                                 "recipe": QUICK["one-shot"],
+                                 "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
     "uncertainty": lambda root: {"data": root / "plain", "seeds": (0,), "splits": ("shuffled",), "samples": 3,
                                  "recipe": QUICK["one-shot"]},
 }  # fmt: skip

@@ -150,6 +150,11 @@ class TwinImaginer(Imaginer):
         """Name in messages."""
         return "twin"
 
+    @property
+    def outcomes(self) -> tuple[str, ...]:
+        """Outcome of each future."""
+        return SLOTS
+
     def imagine_scenes(self, scenes: Scenes) -> ImaginedBatch:
         """Simulate the actions, each in one world or, where something is not told, in many."""
         objects = self._see(scenes)
