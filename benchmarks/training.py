@@ -82,7 +82,8 @@ def shipped_step(label: str, config: LstmConfig) -> Callable[[], None]:
     optimizer = torch.optim.AdamW([p for p in predictor.parameters() if p.requires_grad], fused=True)
     inputs = views() if label == "im-cnn" else torch.randn(BATCH, predictor.features.num_features)
     states, lengths = torch.randn(BATCH, NUM_SAMPLES, 3), torch.full((BATCH,), NUM_SAMPLES)
-    effects = Effects(states, lengths, torch.zeros(BATCH, dtype=torch.long))
+    com = torch.full((BATCH, 3), torch.nan)
+    effects = Effects(states, lengths, torch.zeros(BATCH, dtype=torch.long), com)
 
     def step() -> None:
         features = predictor.features(inputs) if predictor.features.trainable else inputs

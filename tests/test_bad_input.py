@@ -171,6 +171,7 @@ REFUSED = {
         "start = 1e+308 is outside": lambda: ImportConfig(start=1e308),
     },
     PredictionError: {
+        "context is 'nominal': give values by name": lambda: ft.load_predictor().imagine(VIEW, context="nominal"),
         "start is array([0., 0.]): choose from": lambda: ft.load_predictor().imagine_batch(
             ft.InteractionBatch.from_views([VIEW]), np.zeros(2)
         ),

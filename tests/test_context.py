@@ -13,12 +13,13 @@ from foretrace.cli import main
 from foretrace.cli.prediction import _given_context
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
+from foretrace.imagined import LEVELS
 from foretrace.imagined.context import PARAMETERS, nominal_parameters, true_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
 from foretrace.interactions.topdown import TopDownView
-from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, train_predictor
+from foretrace.predictor import LstmConfig, OneShotConfig, TrainConfig, load_predictor, train_predictor
 from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.training import fit_predictor
@@ -135,7 +136,7 @@ def test_without_context_there_are_no_tensors_for_it(tmp_path, batch):
     ("context", "message"),
     [
         (
-            None,
+            "unknown",
             r"is conditioned on friction, density: give context=\{'friction': value of object and table, 'density'",
         ),
         ({"friction": 0.8}, "is conditioned on density: give context="),
@@ -201,7 +202,6 @@ def test_a_checkpoint_with_nonsense_for_context_is_refused(tmp_path, run):
 @pytest.mark.parametrize(
     ("given", "knows", "simulated", "message"),
     [
-        ({"friction": None}, ("friction",), False, "is conditioned on friction: give --friction"),
         ({"tool_friction": 0.0}, ("tool_friction",), False, "--tool-friction is 0.0: give a number above 0"),
         ({"density": 600.0}, (), False, "is not conditioned on density: leave --density out"),
     ],
@@ -230,11 +230,11 @@ def test_the_actions_parameters_are_context_as_constants_are(batch):
     )
     way = [np.linalg.norm(path[-1] - path[0]) for path in (low, high)]
     assert way[1] > 1.3 * way[0]
-    with pytest.raises(
-        PredictionError,
-        match=r"is conditioned on speed: give context=\{'sweep': value in rad, 'speed': value",
-    ):
-        predictor.imagine(view_of(batch, 0), context={"sweep": 0.5})
+    one, other = (
+        predictor.imagine(view_of(batch, 0), context=context).com_trajectory
+        for context in ({"sweep": 0.5}, {"sweep": 0.5, "speed": 1.0})
+    )
+    np.testing.assert_array_equal(one, other)  # by default, the nominal path
 
 
 def test_predict_is_conditioned_on_the_action_and_compares_with_it(tmp_path, batch, capsys):
@@ -245,8 +245,8 @@ def test_predict_is_conditioned_on_the_action_and_compares_with_it(tmp_path, bat
     polygon = tmp_path / "polygon.txt"
     polygon.write_text("0.1 0\n0.02 0.09\n-0.08 0.05\n-0.07 -0.06\n0.04 -0.09\n")
     command = ["predict", str(run), "--polygon", str(polygon), "--edge", "1", "--compare", "--no-animation"]
-    assert main(command) == 2
-    assert "is conditioned on sweep: give --sweep" in capsys.readouterr().err
+    assert main([*command, "--unknown", "--friction", "-1"]) == 2
+    assert "--friction is -1.0: give a number above 0" in capsys.readouterr().err
     rises = {}
     for told in (0.45, 0.95):
         out = tmp_path / f"{told}"
@@ -267,3 +267,88 @@ def test_true_context_is_that_of_physics_and_path():
     found = true_context(Physics(friction=0.6), names, nominal_parameters() | {"insertion": 0.03})
     assert found == {"sweep": ToolPath.sweep, "friction": 0.6, "insertion": 0.03}
     assert list(found) == list(names)
+
+
+# --- constants that need not be told --------------------------------------------------------------------------
+
+
+MARGINAL = OneShotConfig(
+    context=("friction", "density", "contact_error"), hidden_share=0.7, hidden=32, ensemble=2
+)
+
+
+@pytest.fixture(scope="module")
+def marginal(tmp_path_factory, batch):
+    """A predictor that can do without the friction on which the motions depend."""
+    training = TrainConfig(epochs=60, min_steps=1, split=(26, 6, 4), device="cpu", outcomes=("levered",))
+    known = replace(batch, parameters=batch.parameters | {"contact_error": np.zeros(len(batch))})
+    return load_predictor(
+        train_predictor(
+            known, MARGINAL, tmp_path_factory.mktemp("marginal") / "run", training, progress=False
+        )
+    )
+
+
+def test_none_is_nominal_and_a_mapping_tells_what_it_names(marginal, batch):
+    view = view_of(batch, 0)
+    nominal = {"friction": 0.8, "density": 600.0, "contact_error": 0.0}
+    by_default, told = (marginal.imagine(view, context=context) for context in (None, nominal))
+    np.testing.assert_array_equal(by_default.com_trajectory, told.com_trajectory)
+    assert by_default.context == nominal
+    assert "told friction 0.8, density 600, contact_error 0" in repr(by_default)
+    some, nothing, empty = (
+        marginal.imagine(view, context=context) for context in ({"friction": 0.8}, "unknown", {})
+    )
+    assert some.context["friction"] == 0.8
+    assert np.isnan(some.context["density"])
+    assert "not told density, contact_error" in repr(some)
+    np.testing.assert_array_equal(nothing.com_trajectory, empty.com_trajectory)
+    assert all(np.isnan(value) for value in nothing.context.values())
+
+
+def test_what_is_not_told_is_in_the_spread(marginal, batch):
+    known = replace(batch, parameters=batch.parameters | {"contact_error": np.zeros(len(batch))})
+    told, hidden = (marginal.imagine_batch(known, context=context) for context in ("recorded", "unknown"))
+    errors = [np.nanmean(np.linalg.norm(imagined.com - batch.com, axis=2)) for imagined in (told, hidden)]
+    assert errors[0] < 0.8 * errors[1]
+    widths = [np.nanmean(imagined.futures.radius(0.8)[:, :, -1]) for imagined in (told, hidden)]
+    assert widths[0] < widths[1]
+    at_low, at_high = (
+        marginal.imagine_batch(known, context={"friction": friction}).com[:, -1, 2].mean()
+        for friction in (0.5, 1.1)
+    )
+    assert at_low > at_high
+
+
+def test_a_value_that_was_not_recorded_is_not_told(marginal, batch):
+    density = np.where(batch.ids == 3, np.nan, batch.parameters["density"])
+    error = np.where(batch.ids == 4, 0.002, 0.0)
+    mixed = replace(batch, parameters=batch.parameters | {"density": density, "contact_error": error})
+    context = marginal.imagine_batch(mixed).context
+    np.testing.assert_array_equal(np.isnan(context["density"]), batch.ids == 3)
+    np.testing.assert_array_equal(np.isnan(context["contact_error"]), batch.ids == 4)
+
+
+def test_regions_depend_on_start_and_on_what_is_told(marginal, batch):
+    known = replace(batch, parameters=batch.parameters | {"contact_error": np.zeros(len(batch))})
+    quantiles = {
+        (start, str(context)): marginal.imagine_batch(known, start, context=context).futures.quantiles
+        for start in ("observed", "estimated")
+        for context in ("recorded", {"friction": 0.8}, "unknown")
+    }
+    assert all(found.shape == (len(batch), len(LEVELS)) for found in quantiles.values())
+    for start in ("observed", "estimated"):
+        told, some, hidden = (found for (name, _), found in quantiles.items() if name == start)
+        np.testing.assert_array_equal(some, np.maximum(told, hidden))
+    with pytest.raises(
+        PredictionError, match=r"context contact_error is 0\.002: give 0 for a contact as commanded"
+    ):
+        marginal.imagine(view_of(batch, 0), context={"contact_error": 0.002})
+
+
+def test_training_hides_a_share(marginal):
+    inputs = torch.ones(20_000, marginal.num_inputs)
+    hidden = 1 - marginal.hide_context(inputs)[:, -3:]
+    every = hidden.all(dim=1).float().mean()
+    assert every == pytest.approx(0.35 + 0.35 / 8, abs=0.02)
+    assert hidden.any(dim=1).float().mean() == pytest.approx(0.35 + 0.35 * 7 / 8, abs=0.02)

@@ -47,6 +47,13 @@ def radius_of(imagined: "ImaginedEffect") -> np.ndarray | None:
     return radius if np.isfinite(radius).all() else None
 
 
+def percentage(probability: float) -> str:
+    """A probability as it is printed: nothing is certain."""
+    if probability > 0.995:
+        return "over 99 %"
+    return f"{100 * probability:.0f} %" if probability > 0.005 else "under 1 %"
+
+
 def say_futures(imagined: "ImaginedEffect") -> None:
     """Print outcomes, support edge and radius; what is unusual goes to the terminal as warnings."""
     for warning in imagined.warnings:
@@ -55,7 +62,7 @@ def say_futures(imagined: "ImaginedEffect") -> None:
     if futures.is_point:
         return
     probable = sorted(futures.outcomes().items(), key=lambda item: -item[1][0])
-    print("outcome: " + ", ".join(f"{name} {probability[0]:.1%}" for name, probability in probable))
+    print("outcome: " + ", ".join(f"{name} {percentage(probability[0])}" for name, probability in probable))
     (x0, y0), (x1, y1) = 100 * futures.support_points[0, _in_order(futures)[0]]
     print(
         f"turns about the edge from x {x0:.1f}, y {y0:.1f} to x {x1:.1f}, y {y1:.1f} cm in the action frame"

@@ -11,7 +11,7 @@ from foretrace.actions import ToolPath
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
-from foretrace.imagined.context import CONSTANTS, CONTEXT, PARAMETERS
+from foretrace.imagined.context import CONSTANTS, CONTEXT, EXACT, PARAMETERS, nominal_constants
 from foretrace.perception.photo import PhotoConfig
 
 if TYPE_CHECKING:
@@ -149,7 +149,11 @@ def _named(name: str) -> str:
 
 ContextOptions = make_dataclass(
     "ContextOptions",
-    [(name, float | None, field(default=None, metadata={"help": f"{_named(name)}"})) for name in CONTEXT],
+    [
+        (name, float | None, field(default=None, metadata={"help": f"{_named(name)}"}))
+        for name in CONTEXT
+        if name != EXACT
+    ],
     frozen=True,
 )
 """One option for everything that a predictor may be conditioned on."""
@@ -162,6 +166,7 @@ def predict(
     photo: Annotated[OmitArgPrefixes[PhotoOptions], arg(name="photograph")],
     context: Annotated[OmitArgPrefixes[ContextOptions], arg(name="context")],  # pyright: ignore[reportInvalidTypeForm]
     run: Positional[Path | None] = None,
+    unknown: bool = False,
     compare: bool = False,
     animation: bool = True,
     out: Path = Path("prediction"),
@@ -177,6 +182,7 @@ def predict(
         photo: A photograph of the object on a table, in place of object and contact.
         context: Context of a predictor that is conditioned on it, and settings of --compare.
         run: Folder of the training; by default the predictor that comes with foretrace.
+        unknown: Tell the predictor only the constants that are given here; by default the others are the nominal ones.
         compare: Simulate the same lever-up and show truth and error beside the prediction.
         animation: Write an animation as well.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
@@ -200,8 +206,8 @@ def predict(
         object, action, view, com = _object_and_action(obj, at)
     given = _given_context(asdict(context), predictor.context, compare)
     path = ToolPath.of(**{name: value for name, value in given.items() if name in PARAMETERS})
-    action, wanted = replace(action, path=path), {name: given[name] for name in predictor.context}
-    imagined = predictor.imagine(view, action, context=wanted, com=com)
+    action = replace(action, path=path)
+    imagined = predictor.imagine(view, action, context=_told(given, predictor.context, unknown), com=com)
     paths = {predictor.display_name: imagined.com_trajectory}
     truth = _simulate(object, action, given) if compare else None
     if truth is not None and len(truth.effect.times) > 0:
@@ -245,12 +251,10 @@ def _given_context(
     """The context that was given.
 
     Raises:
-        PredictionError: One that the predictor is conditioned on is missing, is not above 0, or is of no use.
+        PredictionError: A value is not above 0, or is of no use.
     """
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
-        if value is None and name in wanted:
-            raise PredictionError(f"the predictor is conditioned on {name}: give {option}")
         if value is not None and not 0 < value < float("inf"):
             raise PredictionError(f"{option} is {value}: give a number above 0")
         if value is not None and name not in wanted and not simulated:
@@ -258,6 +262,12 @@ def _given_context(
                 f"the predictor is not conditioned on {name}: leave {option} out, or --compare"
             )
     return {name: value for name, value in options.items() if value is not None}
+
+
+def _told(given: dict[str, float], context: tuple[str, ...], unknown: bool) -> dict[str, float]:
+    """What the predictor is told: values that were given, and nominal constants unless only the former are known."""
+    usual = {} if unknown else {name: value for name, value in nominal_constants().items() if name in context}
+    return usual | {name: value for name, value in given.items() if name in context}
 
 
 def _simulate(obj: "ObjectModel", action: "LeverUp", given: dict[str, float]) -> "Interaction":

@@ -45,6 +45,8 @@ def draw_inputs(
     if predictor.context:
         mean, scale = (tensor.numpy() for tensor in (predictor.known_mean, predictor.known_scale))
         values = mean + scale * rng.uniform(-2, 2, (len(views), len(mean)))
+        hidden = rng.random((len(views), len(predictor.optional))) < 0.5
+        values[:, predictor.optional] = np.where(hidden, np.nan, values[:, predictor.optional])
         inputs["context"] = values.astype(np.float32)
     return inputs
 

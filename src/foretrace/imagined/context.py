@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +18,15 @@ CONSTANTS = {
     "friction": "of object and table",
     "tool_friction": "of object and blade",
     "density": "in kg/m^3",
+    "contact_error": "in m: 0 where the contact is executed as commanded",
 }
-"""Physical constants by their names in `Physics`."""
+"""Constants by name: those of `Physics`, and how far the executed contact may be from the commanded one."""
+EXACT = "contact_error"
+"""The constant that is either 0 or not known."""
+UNKNOWN = "unknown"
+"""Context in which no constant is told."""
+Context = Mapping[str, float] | Literal["unknown"] | None
+"""What an imaginer is told. None: the nominal constants. Values by name: these, and no others. ``unknown``: none."""
 PARAMETERS = {
     "insertion": "in m",
     "arc_radius": "in m",
@@ -90,54 +97,103 @@ def true_context(
     physics: Physics, names: Sequence[str], parameters: Mapping[str, float] | None = None
 ) -> dict[str, float]:
     """True values of one interaction's context [SI] by the given names; those of the nominal path by default."""
-    values = asdict(physics) | dict(nominal_parameters() if parameters is None else parameters)
+    values = asdict(physics) | {EXACT: 0.0} | dict(nominal_parameters() if parameters is None else parameters)
     return {name: values[name] for name in names}
 
 
-def recorded_context(batch: InteractionBatch, names: Sequence[str]) -> Float[np.ndarray, "batch context"]:
+@cache
+def nominal_constants() -> Mapping[str, float]:
+    """The nominal constants."""
+    return MappingProxyType(true_context(Physics(), tuple(CONSTANTS)))
+
+
+def recorded_context(
+    batch: InteractionBatch, names: Sequence[str], optional: bool = False
+) -> Float[np.ndarray, "batch context"]:
     """Recorded context of interactions, in SI units.
 
+    Args:
+        batch: The interactions.
+        names: The variables that the imaginer is conditioned on.
+        optional: Whether it can do without constants: those that were not recorded are NaN then. A contact that was
+            not executed as commanded is not known.
+
     Raises:
-        PredictionError: One of them lacks a value.
+        PredictionError: One of them lacks a value that it needs.
     """
     values = (
         np.array([column_of(batch, name) for name in names], dtype=float).reshape(len(names), len(batch)).T
     )
-    rows, columns = np.nonzero(~np.isfinite(values))
+    if EXACT in names:
+        column = values[:, names.index(EXACT)]
+        column[column != 0] = np.nan
+    needed = np.array([not (optional and name in CONSTANTS) for name in names], dtype=bool)
+    rows, columns = np.nonzero(~np.isfinite(values) & needed)
     if len(rows):
-        name = names[columns[0]]
+        name = names[int(columns[0])]
         raise PredictionError(
-            f"interaction {batch.ids[rows[0]]} has {name} = {values[rows[0], columns[0]]}: record its {name}, leave "
-            f"it out, or use a predictor that is not conditioned on {name}"
+            f"interaction {batch.ids[rows[0]]} has {name} = {column_of(batch, name)[rows[0]]}: record its {name}, "
+            f"leave it out, or use a predictor that is not conditioned on {name}"
         )
     return values
 
 
 def given_context(
     names: Sequence[str],
-    context: Mapping[str, float] | None,
+    context: Context,
     parameters: Mapping[str, Float[np.ndarray, " n"]],
     number: int = 1,
+    optional: bool = False,
 ) -> Float[np.ndarray, "n context"]:
-    """Context of actions, in SI units.
+    """Context of actions, in SI units; NaN where a constant is not told.
 
     Args:
-        names: The variables that the predictor is conditioned on.
-        context: Values that were given, the same for all actions.
-        parameters: Parameters of the actions' paths, where actions were given; ``context`` may add to them.
+        names: The variables that the imaginer is conditioned on.
+        context: What was given, the same for all actions.
+        parameters: Parameters of the actions' paths, where actions were given, else the path is nominal; ``context``
+            may add to them.
         number: Number of actions.
+        optional: Whether the imaginer can do without constants.
 
     Raises:
         PredictionError: A value is missing, is no finite number, contradicts an action's path, or is none that the
-            predictor is conditioned on.
+            imaginer is conditioned on.
     """
-    context = {} if context is None else context
-    if not isinstance(context, Mapping):
-        raise PredictionError(f"context is {shown(context)}: give values by name, as {{'friction': 0.8}}")
-    if missing := [name for name in names if name not in parameters and name not in context]:
-        wanted = ", ".join(f"{shown(name)}: value {CONTEXT[name]}" for name in names)
+    told = _told(names, context, optional)
+    for name, value in told.items():
+        for planned in parameters.get(name, ()):
+            if abs(planned - nominal_parameters()[name]) > SAME < abs(planned - value):
+                raise PredictionError(
+                    f"context {name} is {value}, the action's path has {planned}: give one of the two"
+                )
+    usual = dict(parameters) if parameters else dict(nominal_parameters())
+    found = np.full((number, len(names)), np.nan)
+    for k, name in enumerate(names):
+        found[:, k] = told.get(name, usual.get(name, np.nan))
+    return found
+
+
+def _told(names: Sequence[str], context: Context, optional: bool) -> dict[str, float]:
+    """Values that are told, by name.
+
+    Raises:
+        PredictionError: As `given_context`.
+    """
+    constants = [name for name in names if name in CONSTANTS]
+    if context is None:
+        return {name: nominal_constants()[name] for name in constants}
+    if isinstance(context, str) and context == UNKNOWN:
+        context = {}
+    elif not isinstance(context, Mapping):
         raise PredictionError(
-            f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}"
+            f"context is {shown(context)}: give values by name, as {{'friction': 0.8}}, 'unknown', or None for the "
+            "nominal ones"
+        )
+    if not optional and (missing := [name for name in constants if name not in context]):
+        wanted = ", ".join(f"{shown(name)}: value {CONTEXT[name]}" for name in constants)
+        raise PredictionError(
+            f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}, or None for the nominal "
+            "values"
         )
     if odd := [name for name in context if name not in names]:
         accepted = ", ".join(names) or "nothing but the view"
@@ -147,15 +203,11 @@ def given_context(
     for name, value in context.items():
         if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
             raise PredictionError(f"context {name} is {shown(value)}: give a finite value {CONTEXT[name]}")
-        for planned in parameters.get(name, ()):
-            if abs(planned - nominal_parameters()[name]) > SAME < abs(planned - value):
-                raise PredictionError(
-                    f"context {name} is {value}, the action's path has {planned}: give one of the two"
-                )
-    found = np.empty((number, len(names)))
-    for k, name in enumerate(names):
-        found[:, k] = context.get(name, parameters.get(name))
-    return found
+    if context.get(EXACT, 0) != 0:
+        raise PredictionError(
+            f"context {EXACT} is {shown(context[EXACT])}: give 0 for a contact as commanded, or leave it out"
+        )
+    return dict(context)
 
 
 def find_unconditioned(

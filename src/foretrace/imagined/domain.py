@@ -10,11 +10,14 @@ from jaxtyping import Bool, Float
 from foretrace.errors import PredictionError
 from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
+from foretrace.objects import BEVEL
 
 LARGEST_GAP = 0.02
 """Largest distance of a contact point from the object's rim, outside or inside [m]."""
 TALLEST = 2.0
 """A greater height is a mistake, such as one in other units [m]."""
+LEVEL_TOP = 0.1
+"""A top is level if its lowest point is no lower than this share of the height below its highest."""
 RELEVANT_SHARE = 0.05
 """A spot in the mask with more than this share of the largest one's pixels is an object of its own."""
 QUANTILES = (0.01, 0.99)
@@ -245,8 +248,8 @@ def measure_candidates(
 def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
     """Centres of mass at rest in the action frame [m], estimated from the views.
 
-    Above the centre of each mask's area, at half the object's greatest height: right for a prism of uniform
-    density but for its bevel.
+    Above the centre of each mask's area, at half the object's greatest height; if its top is level, a little higher,
+    as the bevel of a prism takes mass away at the bottom. Right for a prism of uniform density.
 
     Raises:
         PredictionError: A mask is empty.
@@ -259,7 +262,22 @@ def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
         )
     rows, columns = (counts @ np.arange(counts.shape[1]) / areas for counts in (across, along))
     points = (CONTACT_PIXEL - np.stack([rows, columns], axis=-1)) * METRES_PER_PIXEL
-    return np.concatenate([points, batch.height.max(axis=(1, 2))[:, None] / 2], axis=-1)
+    level = np.array([_centre_height(*view) for view in zip(batch.mask, batch.height, strict=True)])
+    return np.concatenate([points, level[:, None]], axis=-1)
+
+
+def _centre_height(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> float:
+    """Height of the centre of mass [m]: that of a prism with a bevel where the top is level, else half the greatest."""
+    pixels, top = mask.view(np.uint8), float(height.max())
+    if top - float(height[mask].min()) > LEVEL_TOP * top:
+        return top / 2
+    outlines, _ = cv2.findContours(pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    rim = sum(cv2.arcLength(outline, True) for outline in outlines) * METRES_PER_PIXEL
+    inner = float(cv2.distanceTransform(np.pad(pixels, 1), cv2.DIST_L2, 5).max()) * METRES_PER_PIXEL
+    scale = min(1.0, 0.5 * inner / BEVEL.width, 0.5 * top / BEVEL.height)
+    low = scale * BEVEL.height
+    whole, cut = np.count_nonzero(mask) * METRES_PER_PIXEL**2 * top, rim * scale * BEVEL.width * low / 2
+    return (whole * top / 2 - cut * low / 3) / (whole - cut)
 
 
 def _extent(filled: np.ndarray) -> Float[np.ndarray, " batch"]:

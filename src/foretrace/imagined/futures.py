@@ -1,6 +1,7 @@
 """What an imaginer returns: the expected effect, and all futures with their probabilities and regions."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,9 +42,9 @@ class Futures:
     """Expected distance of the centre of mass from it (root mean square) [m]; NaN: unknown."""
     support_points: Float[np.ndarray, "batch futures 2 2"]
     """Ends of the edge that the object turns about, in the action frame at rest [m]; NaN: unknown."""
-    quantiles: Float[np.ndarray, " levels"]
+    quantiles: Float[np.ndarray, "*batch levels"]
     """Distance from the nearest future, in spreads, within which whole motions of the validation part stayed, by
-    `LEVELS`; NaN: unknown."""
+    `LEVELS`; NaN: unknown. One row for each interaction, or one for all."""
 
     @classmethod
     def point(
@@ -79,7 +80,8 @@ class Futures:
         return len(self.probability)
 
     def __getitem__(self, rows: slice | np.ndarray) -> "Futures":
-        names = ("probability", "states", "spread", "support_points")
+        names = ["probability", "states", "spread", "support_points"]
+        names += ["quantiles"] * (self.quantiles.ndim == 2)
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     @property
@@ -114,8 +116,17 @@ class Futures:
         """
         if not LEVELS[0] <= level <= LEVELS[-1]:
             raise PredictionError(f"level {level} of a region: choose one from {LEVELS[0]} to {LEVELS[-1]}")
-        wide = float(np.interp(level, LEVELS, self.quantiles))
+        wide = self.width(level)[..., None, None]
         return np.where(self.counted[..., None], wide * (self.spread + FLOOR), np.nan)
+
+    def width(self, level: float) -> Float[np.ndarray, "*batch"]:
+        """Quantile of a level, in spreads: of each interaction, or of all."""
+        low = int(np.clip(np.searchsorted(LEVELS, level, side="right") - 1, 0, len(LEVELS) - 2))
+        share = (level - LEVELS[low]) / (LEVELS[low + 1] - LEVELS[low])
+        below, above = self.quantiles[..., low], self.quantiles[..., low + 1]
+        with np.errstate(invalid="ignore"):  # 0 x infinity: a level that is one of LEVELS is taken as it is
+            between = (1 - share) * below + share * above
+        return np.where(share < 1e-9, below, np.where(share > 1 - 1e-9, above, between))
 
     def given(self, observed: Float[np.ndarray, "batch samples 6"], sample_period: float) -> "Futures":
         """Futures after the first samples were observed.
@@ -199,13 +210,19 @@ class ImaginedEffect:
     """All futures, one row; the trajectories above are those of the most probable one."""
     warnings: tuple[str, ...] = ()
     """Respects in which object or action are unlike those that the predictor has learned from."""
+    context: Mapping[str, float] = field(default_factory=dict)
+    """What the imaginer was told beside the view, by name [SI]; NaN: not told."""
 
     def __repr__(self) -> str:
         chances = ", ".join(
             f"{name} {float(chance[0]):.3g}" for name, chance in self.futures.outcomes().items()
         )
         warned = f", {len(self.warnings)} warnings" if self.warnings else ""
-        return f"ImaginedEffect({len(self.times)} samples, {chances}{warned})"
+        told = [f"{name} {value:.4g}" for name, value in self.context.items() if not np.isnan(value)]
+        hidden = [name for name, value in self.context.items() if np.isnan(value)]
+        told = f", told {', '.join(told)}" if told else ""
+        hidden = f", not told {', '.join(hidden)}" if hidden else ""
+        return f"ImaginedEffect({len(self.times)} samples, {chances}{told}{hidden}{warned})"
 
 
 @dataclass(frozen=True)
@@ -222,6 +239,8 @@ class ImaginedBatch:
     """As ``ImaginedEffect.futures``, one row for each action."""
     warnings: tuple[tuple[str, ...], ...] = ()
     """As ``ImaginedEffect.warnings``, one entry for each action."""
+    context: Mapping[str, Float[np.ndarray, " batch"]] = field(default_factory=dict)
+    """As ``ImaginedEffect.context``, one value for each action."""
 
     def __len__(self) -> int:
         return len(self.com)
@@ -230,4 +249,5 @@ class ImaginedBatch:
         pose = None if self.pose is None else self.pose[index]
         futures = self.futures[np.array([index])]
         warnings = self.warnings[index] if self.warnings else ()
-        return ImaginedEffect(self.times, self.com[index], pose, futures, warnings)
+        context = {name: float(values[index]) for name, values in self.context.items()}
+        return ImaginedEffect(self.times, self.com[index], pose, futures, warnings, context)

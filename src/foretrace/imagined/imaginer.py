@@ -1,7 +1,7 @@
 """The contract of everything that imagines effects: one door with the same checks, warnings and shapes."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +15,7 @@ from foretrace.errors import PredictionError, check_type, shown
 from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined.context import (
     PARAMETERS,
+    Context,
     column_of,
     find_unconditioned,
     given_context,
@@ -53,7 +54,9 @@ class Scenes:
     com: Float[np.ndarray, "batch 3"]
     """Centres of mass at rest in the action frame [m]."""
     context: Float[np.ndarray, "batch context"]
-    """Values of the imaginer's context [SI]."""
+    """Values of the imaginer's context [SI]; NaN: a constant that is not told."""
+    start: Start = "observed"
+    """Where the centres of mass come from."""
     observed: Float[np.ndarray, "batch samples 6"] | None = None
     """Motions' first samples at the imaginer's sample times, where they are under way: centre of mass in the action
     frame [m] and rotation vector since rest [rad]."""
@@ -82,6 +85,8 @@ class Imaginer(ABC):
 
     context: tuple[str, ...] = ()
     """Variables that it is conditioned on beside the view: names of `foretrace.imagined.context.CONTEXT`."""
+    marginal: bool = False
+    """Whether it can do without constants of its context: its futures then cover what is not told."""
     observes: ClassVar[bool] = False
     """Whether it can be shown the first samples of a motion that is under way."""
 
@@ -110,7 +115,7 @@ class Imaginer(ABC):
         view: TopDownView,
         action: Action | None = None,
         *,
-        context: Mapping[str, float] | None = None,
+        context: Context = None,
         observed: Effect | ObservedMotion | None = None,
         com: Numbers | None = None,
     ) -> ImaginedEffect:
@@ -120,7 +125,8 @@ class Imaginer(ABC):
             view: The object from above, in the action frame.
             action: The action. Its path's parameters are context; a path that is not nominal is pointed out if the
                 imaginer is not conditioned on it. The view's frame says where it acts. None: the nominal path.
-            context: Values of the variables that the imaginer is conditioned on, by name [SI].
+            context: Values of the variables that the imaginer is conditioned on, by name [SI]; a constant that is left
+                out is not told. None tells the nominal constants, ``unknown`` none.
             observed: Beginning of the motion, where it is under way: the record's own `Effect`, or poses with times.
             com: The centre of mass at rest in the action frame [m]. By default that of the observed motion, or the one
                 estimated from the view: above the centre of the mask's area, at half the object's greatest height.
@@ -137,22 +143,28 @@ class Imaginer(ABC):
         if action is not None:
             check_type("action", action, Action, PredictionError)
             parameters = parameters_of([action])
-        values = given_context(self.context, context, parameters)
+        values = given_context(self.context, context, parameters, 1, self.marginal)
         batch = InteractionBatch.from_views([view])
         motion = None if observed is None else observed_motion(observed)
         if com is None and motion is not None and motion.com is not None:
             com = motion.com[0]
-        start = estimate_com(batch)[0] if com is None else _point(com)
-        check_com(view, start)
+        place = estimate_com(batch)[0] if com is None else _point(com)
+        check_com(view, place)
         seen = None
         if motion is not None:
             self._check_observes()
-            seen = motion.states(self.sample_times, start)[None]
-        return self._answer(Scenes(batch, start[None], values, seen), parameters)[0]
+            seen = motion.states(self.sample_times, place)[None]
+        start = "estimated" if com is None else "observed"
+        return self._answer(Scenes(batch, place[None], values, start, seen), parameters)[0]
 
     @final
     def imagine_batch(
-        self, batch: InteractionBatch, start: Start = "observed", observed: int = 0
+        self,
+        batch: InteractionBatch,
+        start: Start = "observed",
+        observed: int = 0,
+        *,
+        context: Context | Literal["recorded"] = "recorded",
     ) -> ImaginedBatch:
         """Imagine the effects of many actions, of which some may have been recorded.
 
@@ -161,6 +173,7 @@ class Imaginer(ABC):
                 ``start`` is ``estimated``; of their constants and parameters those of the context.
             start: Where the centre of mass at rest comes from: the first recorded sample, or the view.
             observed: Number of recorded samples of each motion that are shown to the imaginer.
+            context: As of `imagine`, the same for all; by default what was recorded of each.
 
         Raises:
             PredictionError: As `imagine`, naming the interaction; or no first sample was recorded.
@@ -176,7 +189,11 @@ class Imaginer(ABC):
             with _naming(f"interaction {id}: "):
                 check_object(mask, height)
                 check_contacts(mask, *OWN)
-        values = recorded_context(batch, self.context)
+        if context == "recorded":
+            values = recorded_context(batch, self.context, self.marginal)
+        else:
+            known = {name: column_of(batch, name) for name in PARAMETERS}
+            values = given_context(self.context, context, known, len(batch), self.marginal)
         com = estimate_com(batch)
         if start == "observed":
             com = batch.com[:, 0] if batch.com.shape[1] else np.full_like(com, np.nan)
@@ -186,7 +203,7 @@ class Imaginer(ABC):
                 )
         seen = self._observe_batch(batch, int(observed)) if observed else None
         parameters = {name: column_of(batch, name) for name in PARAMETERS}
-        return self._answer(Scenes(batch, com, values, seen), parameters)
+        return self._answer(Scenes(batch, com, values, start, seen), parameters)
 
     @final
     def imagine_candidates(
@@ -194,7 +211,7 @@ class Imaginer(ABC):
         view: TopDownView,
         actions: Iterable[Action],
         *,
-        context: Mapping[str, float] | None = None,
+        context: Context = None,
         com: Numbers | None = None,
     ) -> ImaginedBatch:
         """Imagine the effects of several actions on one object from a single view.
@@ -226,10 +243,11 @@ class Imaginer(ABC):
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
-        values = given_context(self.context, context, parameters, len(actions))
+        values = given_context(self.context, context, parameters, len(actions), self.marginal)
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
         check_com(view, middle)
-        return self._answer(Scenes(candidates, candidates.enter(middle), values), parameters)
+        start = "estimated" if com is None else "observed"
+        return self._answer(Scenes(candidates, candidates.enter(middle), values, start), parameters)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
         """The imagined effects, with warnings about paths that the imaginer is not conditioned on."""
@@ -237,7 +255,9 @@ class Imaginer(ABC):
         about_objects = imagined.warnings or ((),) * len(scenes)
         about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(scenes)
         warnings = tuple(a + b for a, b in zip(about_objects, about_paths, strict=True))
-        return replace(imagined, warnings=warnings)
+        return replace(
+            imagined, warnings=warnings, context=dict(zip(self.context, scenes.context.T, strict=True))
+        )
 
     def _observe_batch(self, batch: InteractionBatch, count: int) -> Float[np.ndarray, "batch samples 6"]:
         """The first recorded samples of each motion at the imaginer's sample times."""

@@ -18,7 +18,7 @@ from foretrace.geometry import finite_array
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
-from foretrace.objects import ObjectModel
+from foretrace.objects import ObjectModel, Weighted
 
 
 @dataclass(frozen=True)
@@ -214,6 +214,7 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
     slip_index = table["slip_index"].to_numpy()
     constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
     constants["contact_error"] = _contact_errors(table)
+    constants["com_offset"] = _com_offsets(table, objects)
     return InteractionBatch(
         ids=table["id"].to_numpy(),
         mask=storage.unpack_masks(table["mask"].to_pylist()),
@@ -237,6 +238,13 @@ def _contact_errors(table: pa.Table) -> Float[np.ndarray, " batch"]:
     ahead, left = (table[storage.EXECUTION + name].to_numpy().astype(float) for name in ("ahead", "left"))
     simulated = np.array([source == "simulated" for source in table["source"].to_pylist()], dtype=bool)
     return np.where(simulated, np.hypot(ahead, left), np.nan)
+
+
+def _com_offsets(table: pa.Table, objects: Mapping[str, ObjectModel]) -> Float[np.ndarray, " batch"]:
+    """Distances of the centres of mass from those of uniform objects [m]."""
+    known = [objects[description] for description in table["object"].to_pylist()]
+    offsets = [obj.com_offset if isinstance(obj, Weighted) else np.zeros(2) for obj in known]
+    return np.linalg.norm(np.array(offsets).reshape(-1, 2), axis=1)
 
 
 def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
 from foretrace.errors import TrainingError, shown
 from foretrace.features import Precision
-from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes
+from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes, Start
+from foretrace.imagined.context import CONSTANTS
 from foretrace.imagined.domain import Ranges, find_unusual
 from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import InteractionBatch
@@ -113,6 +114,9 @@ class EffectPredictor(Imaginer, nn.Module):
         if self.context:  # without context it has the tensors of the oldest checkpoints; so are their names
             self.register_buffer("known_mean", torch.zeros(len(self.context)))
             self.register_buffer("known_scale", torch.ones(len(self.context)))
+        self.marginal = config.hidden_share > 0
+        self.optional = [k for k, name in enumerate(self.context) if self.marginal and name in CONSTANTS]
+        """Columns of the context that need not be told; behind the context, the network is given whether they were."""
 
     # --- to be written ------------------------------------------------------------------------------------
 
@@ -171,6 +175,7 @@ class EffectPredictor(Imaginer, nn.Module):
         features: Float[Tensor, "batch inputs"],
         com: Float[np.ndarray, "batch 3"],
         observed: Float[np.ndarray, "batch samples 6"] | None = None,
+        start: Start = "observed",
     ) -> ImaginedBatch:
         """Effects from what `add_context` gives; by default one future each, that of `roll_out`.
 
@@ -178,6 +183,7 @@ class EffectPredictor(Imaginer, nn.Module):
             features: Features and context.
             com: Centres of mass at rest in the action frame [m].
             observed: As `Scenes.observed`; only a predictor that ``observes`` is given any.
+            start: As `Scenes.start`.
         """
         states = self.imagine_states(features, rest_states(com, self.state))
         pose = None if self.state == "position" else decode_poses(states)
@@ -220,7 +226,7 @@ class EffectPredictor(Imaginer, nn.Module):
     @property
     def num_inputs(self) -> int:
         """Length of what the network is given: features of the object, and the context."""
-        return self.features.num_features + len(self.context)
+        return self.features.num_features + len(self.context) + len(self.optional)
 
     @final
     @property
@@ -238,7 +244,7 @@ class EffectPredictor(Imaginer, nn.Module):
             else self.features.inputs(source)
         )
         features = self.add_context(self.compute_features(inputs), scenes.context)
-        imagined = self.imagine_effects(features, scenes.com, scenes.observed)
+        imagined = self.imagine_effects(features, scenes.com, scenes.observed, scenes.start)
         if not self.ranges:
             return imagined
         unusual = find_unusual(scenes.measure() | self.features.measure(inputs), self.ranges)
@@ -281,10 +287,14 @@ class EffectPredictor(Imaginer, nn.Module):
     def set_context(self, values: Float[np.ndarray, "batch context"]) -> None:
         """Fix how the context is standardised: by mean and deviation of the training part's."""
         if self.context:
-            mean, scale = values.mean(axis=0), values.std(axis=0)
+            told = np.isfinite(values).any(axis=0)
+            mean, scale = (
+                np.where(told, found(np.where(told, values, 0.0), axis=0), 0.0)
+                for found in (np.nanmean, np.nanstd)
+            )
             self.known_mean.copy_(torch.from_numpy(mean))
             # A value that is the same everywhere tells nothing apart: it is only shifted.
-            same = scale <= 1e-9 * np.abs(mean)
+            same = scale <= 1e-9 * np.maximum(np.abs(mean), 1e-9)
             self.known_scale.copy_(torch.from_numpy(np.where(same, 1.0, scale)))
 
     @final
@@ -293,12 +303,41 @@ class EffectPredictor(Imaginer, nn.Module):
         features: Float[Tensor, "batch features"],
         values: Float[np.ndarray, "batch context"] | Float[Tensor, "batch context"] | None,
     ) -> Float[Tensor, "batch inputs"]:
-        """Inputs of the network: features of objects, and behind them the context, standardised."""
+        """Inputs of the network: features of objects, and behind them the context, standardised.
+
+        Of a value that is not told (NaN) the network is given the mean, and that it was not told.
+        """
         if not self.context:
             return features
         assert values is not None
         context = torch.as_tensor(values, dtype=torch.float32, device=self.device)
-        return torch.cat([features, (context - self.known_mean) / self.known_scale], dim=1)
+        standard = (context - self.known_mean) / self.known_scale
+        if not self.optional:
+            return torch.cat([features, standard], dim=1)
+        told = ~context[:, self.optional].isnan()
+        return torch.cat([features, torch.where(context.isnan(), 0.0, standard), told.float()], dim=1)
+
+    @final
+    def hide_context(self, inputs: Float[Tensor, "batch inputs"]) -> Float[Tensor, "batch inputs"]:
+        """Inputs of which constants are hidden at random, as ``hidden_share`` of the settings asks for."""
+        if not self.optional:
+            return inputs
+        rows, number = len(inputs), len(self.optional)
+        chance = torch.rand(rows, 1, device=inputs.device)
+        some = torch.rand(rows, number, device=inputs.device) < 0.5
+        hidden = (chance < self.config.hidden_share / 2) | (some & (chance < self.config.hidden_share))
+        return self.without_context(inputs, hidden)
+
+    @final
+    def without_context(
+        self, inputs: Float[Tensor, "batch inputs"], hidden: Bool[Tensor, "batch optional"]
+    ) -> Float[Tensor, "batch inputs"]:
+        """Inputs of which the given constants are hidden."""
+        inputs, first = inputs.clone(), self.features.num_features
+        for k, column in enumerate([first + column for column in self.optional]):
+            inputs[:, column] *= ~hidden[:, k]
+        inputs[:, inputs.shape[1] - len(self.optional) :] *= ~hidden
+        return inputs
 
     @final
     def normalise(self, states: Float[np.ndarray, "*batch state"]) -> Float[Tensor, "*batch state"]:

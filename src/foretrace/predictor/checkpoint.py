@@ -26,6 +26,8 @@ CONFIG = "config.json"
 MODEL = "model.safetensors"
 DEFAULT = "default"
 """Folder of the predictor that comes with the package."""
+ADDED = {"hidden_share"}
+"""Settings that earlier checkpoints do not have; they had what is the default."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
 UNBOUNDED = "quantiles"
@@ -129,8 +131,20 @@ def load_predictor(path: str | Path | None = None) -> EffectPredictor:
     # Its first weights are drawn only to be replaced: the caller's random numbers must not notice.
     with torch.random.fork_rng(devices=[]):
         predictor = _make(config, path / CONFIG)
-    load_tensors(predictor, tensors, model)
+    load_tensors(predictor, _renewed(tensors, predictor), model)
     return predictor.eval()
+
+
+def _renewed(tensors: dict[str, Tensor], predictor: EffectPredictor) -> dict[str, Tensor]:
+    """Tensors of an earlier version in the form of today's.
+
+    Quantiles were those of an observed start alone, and probabilities had no temperature.
+    """
+    wanted = predictor.state_dict()
+    if (found := tensors.get(UNBOUNDED)) is None or UNBOUNDED not in wanted or found.ndim != 1:
+        return tensors
+    renewed = {name: wanted[name] for name in ("temperature", "start_error") if name not in tensors}
+    return tensors | renewed | {UNBOUNDED: found.expand_as(wanted[UNBOUNDED])}
 
 
 def read_config(path: Path) -> PredictorEntries:
@@ -213,7 +227,7 @@ def _make(content: PredictorEntries, file: Path) -> EffectPredictor:
     settings = content["config"]
     try:
         config_class = PREDICTORS.find(content["predictor"]).config_class
-        if odd := sorted({field.name for field in fields(config_class)} ^ settings.keys()):
+        if odd := sorted({field.name for field in fields(config_class)} ^ (settings.keys() | ADDED)):
             raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
         tuples: dict[str, Any] = {
             name: tuple(value) for name, value in settings.items() if isinstance(value, list)

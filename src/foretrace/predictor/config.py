@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
-from foretrace.errors import TrainingError, check_type, fault, shown, wrong_type
+from foretrace.errors import TrainingError, check_ranges, check_type, fault, shown, wrong_type
 from foretrace.features import FEATURES, FeatureExtractor, Option, make_features
 from foretrace.imagined.context import check_names
 from foretrace.interactions.record import Outcome
@@ -139,7 +139,11 @@ class PredictorConfig:
     feature_options: dict[str, Option] = field(default_factory=dict)
     """Settings of the feature extractor, by name."""
     context: tuple[str, ...] = ()
-    """Conditioning variables beside the view: friction, tool_friction, density; parameters of the action's path."""
+    """Conditioning variables beside the view: friction, tool_friction, density, contact_error; parameters of the
+    action's path."""
+    hidden_share: float = 0.0
+    """Share of the lever-ups of which training hides constants of the context: of half of them all, of the others some.
+    The predictor can then do without any. 0: all must be told."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.context, tuple | list):
@@ -147,6 +151,7 @@ class PredictorConfig:
         object.__setattr__(self, "context", tuple(self.context))
         check_type("feature_options", self.feature_options, dict, TrainingError)
         check_names(self.context)
+        check_ranges(TrainingError, "predictor", self, {"hidden_share": (0.0, 1.0)}, "give a share")
         FEATURES.find(self.features)
 
     def make(self, num_samples: int) -> "EffectPredictor":

@@ -9,7 +9,7 @@ import numpy as np
 
 from foretrace.errors import TrainingError
 from foretrace.files import as_json, flatten, read_json
-from foretrace.imagined import LEVELS, STARTS, conformal_scores
+from foretrace.imagined import STARTS, conformal_scores
 from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
@@ -166,7 +166,7 @@ def _calibration(predictor: EffectPredictor, test: InteractionBatch) -> str:
     scores = conformal_scores(futures, test.com, lengths)
     rows = []
     for level in SHOWN_LEVELS:
-        held = scores <= np.interp(level, LEVELS, futures.quantiles)
+        held = scores <= futures.width(level)
         radius = futures.radius(level)[np.arange(len(test)), futures.probability.argmax(axis=1)]
         end = CM * float(np.median(radius[np.arange(len(test)), lengths - 1]))
         rows.append([f"{level:.0%}", f"{held.mean():.1%}", f"{end:.2f}" if np.isfinite(end) else "unknown"])

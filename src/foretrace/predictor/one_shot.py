@@ -13,7 +13,15 @@ from foretrace.errors import TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
 from foretrace.features.outline import HEIGHT_CELLS
-from foretrace.imagined import LEVELS, Futures, ImaginedBatch, conformal_scores, quantiles_of
+from foretrace.imagined import (
+    LEVELS,
+    STARTS,
+    Futures,
+    ImaginedBatch,
+    Start,
+    conformal_scores,
+    quantiles_of,
+)
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.hull import MAX_CORNERS
 from foretrace.predictor.base import EffectPredictor
@@ -29,6 +37,7 @@ from foretrace.predictor.ensemble import MANY, Ensemble
 from foretrace.predictor.mixture import COORDINATES, TURN_LENGTH, Mixture, along_edges
 from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
 from foretrace.predictor.states import Effects, decode_poses
+from foretrace.predictor.temperature import Odds, fit_temperatures, tempered
 from foretrace.predictor.traced import TracedDistribution
 from foretrace.predictor.trajectory_basis import find_basis, fit_covariance
 
@@ -49,6 +58,8 @@ They disagree most about objects unlike those learned from. Measured on triangle
 objects beyond the paper's 160: with 4 to 16, regions are about as exact there as on known shapes; without, they are far
 too narrow.
 """
+CLEAR_EDGE = 0.002
+"""Futures about two edges that differ by less do not tell about which the object turned [m]."""
 SAMPLES_PER_STEP = 15
 """Samples of the trajectories, drawn at random, that one training step compares: it makes the step cheaper."""
 
@@ -134,6 +145,8 @@ class OneShotPredictor(EffectPredictor):
     parity: Tensor
     covariance: Tensor
     quantiles: Tensor
+    temperature: Tensor
+    start_error: Tensor
 
     def __init__(self, config: OneShotConfig, num_samples: int):
         super().__init__(config, num_samples, "turn", config.outcomes)
@@ -147,7 +160,8 @@ class OneShotPredictor(EffectPredictor):
         components = config.components
         widths = (config.hidden,) * config.layers
         self.networks = Ensemble(
-            config.ensemble, (numbers + len(self.context), *widths, outcomes * (components + 2))
+            config.ensemble,
+            (numbers + self.num_inputs - self.features.num_features, *widths, outcomes * (components + 2)),
         )
         self.register_buffer("value_mean", torch.zeros(numbers))
         self.register_buffer("value_scale", torch.ones(numbers))
@@ -155,7 +169,10 @@ class OneShotPredictor(EffectPredictor):
         self.register_buffer("motions", torch.zeros(components, num_samples, COORDINATES))  # the PCA basis
         self.register_buffer("parity", torch.ones(components))
         self.register_buffer("covariance", torch.eye(components).repeat(outcomes, 1, 1))
-        self.register_buffer("quantiles", torch.ones(len(LEVELS)))
+        # For a start that is observed or estimated, and for a context that is told or not.
+        self.register_buffer("quantiles", torch.ones(len(STARTS), 2, len(LEVELS)))
+        self.register_buffer("temperature", torch.ones(2))  # of outcomes, and of edges given the outcome
+        self.register_buffer("start_error", torch.zeros(len(STARTS)))  # of centres of mass at rest [m]
 
     @property
     def display_name(self) -> str:
@@ -242,16 +259,46 @@ class OneShotPredictor(EffectPredictor):
             mine = residuals[effects.outcomes == outcome]
             others = other_residuals[other_effects.outcomes == outcome]
             self.covariance[outcome] = fit_covariance(mine if len(mine) else residuals, others)
-        scores = [self._scores(*piece) for piece in _pieces(other_features, other_effects)]
-        self.quantiles.copy_(torch.from_numpy(quantiles_of(np.concatenate(scores))))
+        self._calibrate(other_features, other_effects)
+
+    def _calibrate(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
+        """Fit temperatures and quantiles to a part that the networks have not learned from."""
+        self.temperature.fill_(1.0)
+        every = torch.ones(len(features), len(self.optional), dtype=torch.bool, device=self.device)
+        inputs = [features, self.without_context(features, every)] if self.optional else [features]
+        views = [piece for each in inputs for piece in _pieces(each, effects)]
+        self.temperature.copy_(fit_temperatures([self._odds(*piece) for piece in views]))
+        uniform = effects.estimated_com.isfinite().all(dim=1)
+        off = (effects.estimated_com - self._com(effects.states))[uniform].square().sum(dim=1)
+        if len(off):
+            self.start_error[STARTS.index("estimated")] = off.mean().sqrt()
+        for told, each in enumerate(inputs):
+            for start, name in enumerate(STARTS):
+                rows = uniform.nonzero()[:, 0] if name == "estimated" else torch.arange(len(effects))
+                scores = [self._scores(*piece, name) for piece in _pieces(each[rows], effects[rows])]
+                found = quantiles_of(np.concatenate([np.zeros(0), *scores]))
+                self.quantiles[start, told:] = torch.from_numpy(found)
 
     def _scores(
-        self, features: Float[Tensor, "batch inputs"], effects: Effects
+        self, features: Float[Tensor, "batch inputs"], effects: Effects, start: Start
     ) -> Float[np.ndarray, " batch"]:
         """Conformal scores of observed motions."""
-        futures = self._futures(self.mixture(features, self._com(effects.states)))
+        com = self._com(effects.states) if start == "observed" else effects.estimated_com
+        futures = self._futures(self.mixture(features, com), self.quantiles[0, 0], start)
         truth = self._metres(effects.states).double().cpu().numpy()
         return conformal_scores(futures, truth, effects.lengths.cpu().numpy())
+
+    def _odds(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Odds:
+        """Predicted log-probabilities, and what happened."""
+        mixture = self.mixture(features, self._com(effects.states))
+        rows = torch.arange(len(effects), device=self.device)
+        weights = mixture.mean[rows, :, effects.outcomes]
+        truth = along_edges(mixture.axes, self._motion(self._held(effects))).flatten(2)
+        moved = self.mean_motion.flatten() + weights @ self.motions.flatten(1)
+        off = (moved - truth).unflatten(2, (-1, COORDINATES))[..., :3].norm(dim=3).mean(dim=2)
+        clear = ((off[:, :1] - off[:, 1:]).abs() > CLEAR_EDGE).any(dim=1)
+        edge = torch.where(clear, off.argmin(dim=1), -1)
+        return Odds(mixture.log_probability, effects.outcomes, edge)
 
     def roll_out(
         self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
@@ -265,11 +312,12 @@ class OneShotPredictor(EffectPredictor):
         features: Float[Tensor, "batch inputs"],
         com: Float[np.ndarray, "batch 3"],
         observed: Float[np.ndarray, "batch samples 6"] | None = None,
+        start: Start = "observed",
     ) -> ImaginedBatch:
         """Effects with all futures, of which the most probable one is the expected one."""
         with torch.inference_mode():
-            start = torch.as_tensor(com, dtype=torch.float32, device=self.device)
-            futures = self._futures(self.mixture(features, start))
+            place = torch.as_tensor(com, dtype=torch.float32, device=self.device)
+            futures = self._futures(self.mixture(features, place), self._quantiles_of(features, start), start)
         if observed is not None:
             futures = futures.given(observed, float(self.times[1] - self.times[0]))
         best = futures.states[np.arange(len(com)), futures.probability.argmax(axis=1)].astype(float)
@@ -333,7 +381,7 @@ class OneShotPredictor(EffectPredictor):
             com=com,
             axes=edges.axes[:, 0],
             ends=edges.ends,
-            log_probability=logits.flatten(1).log_softmax(dim=1).view_as(logits),
+            log_probability=tempered(logits.flatten(1).log_softmax(dim=1).view_as(logits), self.temperature),
             mean=mean,
             error=(expected.square() + DISAGREEMENT**2 * apart).sqrt(),
             covariance=self.covariance,
@@ -341,15 +389,28 @@ class OneShotPredictor(EffectPredictor):
             mean_motion=self.mean_motion,
         )
 
-    def _futures(self, mixture: Mixture) -> Futures:
+    def _quantiles_of(
+        self, features: Float[Tensor, "batch inputs"], start: Start
+    ) -> Float[Tensor, "*batch levels"]:
+        """Quantiles for a start, and for how much of the context is told; of a part of it, the larger ones."""
+        told, nothing = self.quantiles[STARTS.index(start)]
+        if not self.optional:
+            return told
+        flags = features[:, features.shape[1] - len(self.optional) :] > 0
+        some = torch.where(flags.any(dim=1)[:, None], told.maximum(nothing), nothing)
+        return torch.where(flags.all(dim=1)[:, None], told, some)
+
+    def _futures(self, mixture: Mixture, quantiles: Float[Tensor, "*batch levels"], start: Start) -> Futures:
         ends = mixture.ends[:, :, None].expand(*mixture.log_probability.shape, 2, 2).flatten(1, 2)
+        own = self.start_error[STARTS.index(start)]
+        spread = mixture.spread().double()
         return Futures(
             probability=mixture.log_probability.flatten(1).exp().double().cpu().numpy(),
             outcome=self.outcomes * self.config.pivot_edges,
             states=mixture.states().cpu().numpy(),
-            spread=mixture.spread().double().cpu().numpy(),
+            spread=(spread if start == "observed" else torch.hypot(spread, own.double())).cpu().numpy(),
             support_points=ends.double().cpu().numpy(),
-            quantiles=self.quantiles.double().cpu().numpy(),
+            quantiles=quantiles.double().cpu().numpy(),
         )
 
     def _residuals(

@@ -8,8 +8,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from foretrace.errors import TrainingError, shown
-from foretrace.imagined.context import recorded_context
-from foretrace.imagined.domain import measure
+from foretrace.imagined.context import column_of, recorded_context
+from foretrace.imagined.domain import estimate_com, measure
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
@@ -37,6 +37,8 @@ class Part:
     """(batch,) samples of each trajectory that count."""
     outcomes: np.ndarray
     """(batch,) numbers of the outcomes that the predictor distinguishes."""
+    estimated_com: np.ndarray
+    """(batch, 3) centres of mass at rest as estimated from the views [m]; NaN of weighted objects."""
     measures: dict[str, np.ndarray]
     """(batch,) measures by which objects are compared."""
     features: Tensor | None = field(default=None, init=False)
@@ -70,12 +72,19 @@ def prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = 
     return Part(
         source=source,
         inputs=inputs,
-        context=recorded_context(source, predictor.context),
+        context=recorded_context(source, predictor.context, predictor.marginal),
         states=predictor.encode(source),
         lengths=predictor.lengths(source),
         outcomes=predictor.number_outcomes(source),
+        estimated_com=_estimated_com(source),
         measures=measure(source, source.com[:, 0]) | predictor.features.measure(inputs),
     )
+
+
+def _estimated_com(source: InteractionBatch) -> np.ndarray:
+    """Estimated centres of mass, NaN where the estimate cannot be right: of weighted objects."""
+    uniform = np.nan_to_num(column_of(source, "com_offset")) == 0
+    return np.where(uniform[:, None], estimate_com(source), np.nan)
 
 
 def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
@@ -90,6 +99,7 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
             "states": piece.states.astype(np.float32 if len(source) > LARGE else np.float64),
             "lengths": piece.lengths,
             "outcomes": piece.outcomes,
+            "estimated_com": piece.estimated_com,
         }
         for whole, found in ((columns, own), (measures, piece.measures)):
             for name, values in found.items():

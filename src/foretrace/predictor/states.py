@@ -38,12 +38,14 @@ class Effects:
     """Samples of each trajectory that count."""
     outcomes: Int[Tensor, " batch"]
     """Number of each one's outcome among those that the predictor distinguishes."""
+    estimated_com: Float[Tensor, "batch 3"]
+    """Centres of mass at rest as estimated from the views [m]; NaN: not to be estimated, the object is weighted."""
 
     def __len__(self) -> int:
         return len(self.states)
 
     def __getitem__(self, rows: Tensor) -> "Effects":
-        return Effects(self.states[rows], self.lengths[rows], self.outcomes[rows])
+        return Effects(self.states[rows], self.lengths[rows], self.outcomes[rows], self.estimated_com[rows])
 
 
 def state_size(kind: StateKind) -> int:

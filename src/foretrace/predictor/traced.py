@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from foretrace.features.base import UNIT
 from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.geometry import quaternion_to_matrix, rotation_from_6d
-from foretrace.imagined import FLOOR, LEVELS
+from foretrace.imagined import FLOOR, LEVELS, STARTS
 from foretrace.imagined.context import CONTEXT
 from foretrace.interactions.hull import MAX_CORNERS
 from foretrace.predictor.states import decode_poses, rest_states
@@ -42,7 +42,8 @@ class TracedPredictor(nn.Module, ABC):
         self.inputs = {"com": "centre of mass at rest in the action frame [m]"}
         if predictor.context:
             meanings = ", ".join(f"{name} {CONTEXT[name]}" for name in predictor.context)
-            self.inputs["context"] = f"conditioning variables of the action: {meanings}"
+            hidden = "; NaN: a constant that is not told" if predictor.marginal else ""
+            self.inputs["context"] = f"conditioning variables of the action: {meanings}{hidden}"
 
     @abstractmethod
     def imagine(self, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -84,13 +85,19 @@ class TracedDistribution(TracedPredictor):
 
     def facts(self) -> dict[str, Any]:
         """Facts that a reader of the file needs beside its inputs and outputs."""
-        quantiles = [q if np.isfinite(q) else None for q in self.predictor.quantiles.tolist()]
+        quantiles = {
+            f"start {start}, context {told}": [q if np.isfinite(q) else None for q in values.tolist()]
+            for start, kinds in zip(STARTS, self.predictor.quantiles, strict=True)
+            for told, values in zip(("told", "unknown"), kinds, strict=True)
+        }
         return super().facts() | {
             "futures": self.predictor.outcomes * self.predictor.config.pivot_edges,
             "levels": LEVELS.tolist(),
             "quantiles": quantiles,
             "floor": FLOOR,
-            "radius": "of the tube of a level [m]: its quantile x (spread + floor)",
+            "start_error": self.predictor.start_error.tolist()[-1],
+            "radius": "of the tube of a level [m]: its quantile x (spread + floor); where the centre of mass was "
+            "estimated, spread is sqrt(spread^2 + start_error^2)",
         }
 
     def imagine(self, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -279,7 +279,8 @@ class _Training:
         lengths, outcomes = (
             torch.from_numpy(numbers).to(predictor.device) for numbers in (part.lengths, part.outcomes)
         )
-        return Effects(states, lengths, outcomes)
+        estimated = torch.as_tensor(part.estimated_com, dtype=torch.float32, device=predictor.device)
+        return Effects(states, lengths, outcomes, estimated)
 
     def _features_of(self, part: Part) -> Tensor:
         """Features and context of a part; computed once if the extractor is not trained with the predictor."""
@@ -311,7 +312,7 @@ class _Training:
                     features = predictor.add_context(features, self.train.context[rows.numpy()])
                 else:
                     features = fixed[rows]
-                loss = predictor.training_loss(features, self.effects[rows])
+                loss = predictor.training_loss(predictor.hide_context(features), self.effects[rows])
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
