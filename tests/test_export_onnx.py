@@ -17,7 +17,7 @@ from foretrace.export.networks import draw_inputs, network_of
 from foretrace.features import ImageCnn
 from foretrace.features.windows import convolve_unbranched, convolve_windows
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
-from foretrace.imagined import estimate_com
+from foretrace.imagined import STARTS, estimate_com
 from foretrace.predictor import LstmConfig, LstmPredictor, OneShotConfig, OneShotPredictor, save_checkpoint
 from foretrace.predictor.states import state_size
 from test_examples import EXAMPLES, run_python
@@ -129,7 +129,11 @@ def test_a_file_tells_what_it_is(command):
     assert facts["futures"] == ["levered", "slipped", "levered", "slipped"]
     assert facts["times"] == predictor.times.tolist()
     assert facts["predictor"] == "one-shot"
-    assert facts["quantiles"] == pytest.approx(predictor.quantiles.tolist())
+    kinds = [f"start {start}, context {told}" for start in STARTS for told in ("told", "unknown")]
+    assert list(facts["quantiles"]) == kinds
+    for found, wanted in zip(facts["quantiles"].values(), predictor.quantiles.flatten(0, 1), strict=True):
+        assert found == pytest.approx(wanted.tolist())
+    assert facts["start_error"] == pytest.approx(float(predictor.start_error[1]))
     assert facts["config"]["feature_options"] == {"heights": True}
     assert facts["frame"].startswith("action: origin at the contact point")
     assert {i.name: i.doc_string for i in model.graph.input} == network_of(predictor).inputs

@@ -141,7 +141,7 @@ def test_predict_tells_of_futures(run: Path, picture: Path, tmp_path: Path, caps
     command = ["predict", str(run), "--image", str(picture), "--scale", "0.0014", "--edge", "2"]
     assert cli.main([*command, "--no-animation", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert re.search(r"^outcome: (levered|slipped) \d+\.\d%, ", printed)
+    assert re.search(r"^outcome: (levered|slipped) (over )?\d+\.\d%, ", printed)
     content = json.loads((tmp_path / "trajectory.json").read_text())
     assert content["com_trajectory"] == content["futures"][0]["com_trajectory"]
     assert len(content["futures"]) == 4

@@ -14,6 +14,8 @@ LEVEL = 0.9
 """Probability of the region that is told of."""
 LARGEST_RADIUS = 0.5
 """A wider region says nothing and is not drawn [m]."""
+SUREST = 0.995
+"""Probabilities beyond are not told more exactly: they were fitted to a few thousand lever-ups."""
 LEAST_PROBABLE = 0.01
 """Futures less probable than this are not drawn."""
 
@@ -49,9 +51,9 @@ def radius_of(imagined: "ImaginedEffect") -> np.ndarray | None:
 
 def percentage(probability: float) -> str:
     """A probability as it is printed: nothing is certain."""
-    if probability > 0.995:
-        return "over 99 %"
-    return f"{100 * probability:.0f} %" if probability > 0.005 else "under 1 %"
+    if probability > SUREST:
+        return f"over {SUREST:.1%}"
+    return f"{probability:.1%}" if probability > 1 - SUREST else f"under {1 - SUREST:.1%}"
 
 
 def say_futures(imagined: "ImaginedEffect") -> None:
