@@ -34,6 +34,7 @@ SUMMARIES = {
     "replay": "Deviation of simulated motions from recorded ones.",
     "transfer": "Predictions against recordings, or a stand-in for the robot.",
     "twin": "The twin, which simulates what it sees, beside what is learned.",
+    "shipped": "The predictor that comes with foretrace, on lever-ups that it was not trained on.",
     "other-world": "Few lever-ups of another world, learned alone or over a twin.",
     "non-flat": "Masks against height maps of objects that are not flat.",
     "uncertainty": "Calibration of probabilities, regions and samples.",
