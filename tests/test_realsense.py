@@ -114,6 +114,19 @@ def test_a_recording_is_a_film(recording: Path) -> None:
     assert len(list(film.frames())) == FRAMES, "a film can be read again"
 
 
+def test_no_frame_is_lost_whenever_reading_begins_and_ends(recording: Path) -> None:
+    """Streams open one after the other, and nobody reads yet: what the library plays meanwhile would be gone."""
+    for number in range(12):
+        with realsense._Playing(recording) as playing:
+            time.sleep(0.1 * (number % 3))
+            if number % 2:
+                next(playing.frames())
+                continue
+            frames = list(playing.frames())
+        assert [round(30 * (frame.time - 1)) for frame in frames] == list(range(FRAMES)), number
+        assert all(frame.depth is not None for frame in frames), number
+
+
 def test_recordings_that_lack_something(tmp_path: Path, recording: Path) -> None:
     frames = list(open_recording(record(tmp_path / "flat.db3", depth=False)).frames())
     assert len(frames) == FRAMES
@@ -161,10 +174,10 @@ def plugged_in(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def start(self, asked: Any) -> Any:
             self._pipeline, played = pipeline(), config()
             played.enable_device_from_file(str(recording), repeat_playback=False)
-            played.resolve(rs.pipeline_wrapper(self._pipeline)).get_device().as_playback().set_real_time(
-                False
-            )
-            return self._pipeline.start(played)
+            realsense.hold(played.resolve(rs.pipeline_wrapper(self._pipeline)).get_device().as_playback())
+            profile = self._pipeline.start(played)
+            realsense.release(profile.get_device().as_playback())
+            return profile
 
         def wait_for_frames(self, timeout: int) -> Any:
             return self._pipeline.wait_for_frames(timeout)

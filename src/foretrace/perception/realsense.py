@@ -5,8 +5,10 @@ recordings of a virtual camera only.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -90,6 +92,22 @@ def _library() -> Any:
     return pyrealsense2
 
 
+def hold(recorded: Any) -> None:
+    """Hold a recording before the pipeline that plays it starts: until all streams are open, frames are lost."""
+    recorded.set_real_time(False)
+    recorded.pause()
+
+
+def release(recorded: Any) -> None:
+    """Let the frames of a recording come. The library waits until they are read, so it waits in a thread."""
+
+    def resume() -> None:
+        with suppress(RuntimeError):  # where reading has ended before
+            recorded.resume()
+
+    Thread(target=resume, daemon=True).start()
+
+
 class _Playing:
     """A recording being played, as fast as it is read."""
 
@@ -101,9 +119,8 @@ class _Playing:
         config = self._rs.config()
         try:
             config.enable_device_from_file(str(self._path), repeat_playback=False)
-            # Before it starts: its first frames would be lost.
             found = config.resolve(self._rs.pipeline_wrapper(self._pipeline))
-            found.get_device().as_playback().set_real_time(False)
+            hold(found.get_device().as_playback())
             self._profile = self._pipeline.start(config)
         except RuntimeError as error:
             raise PerceptionError(
@@ -126,6 +143,7 @@ class _Playing:
 
     def _framesets(self) -> Iterator[Any]:
         recorded, silence = self._profile.get_device().as_playback(), 0
+        release(recorded)
         while silence < SILENCE:
             there, frames = self._pipeline.try_wait_for_frames(GLANCE)
             if there:
