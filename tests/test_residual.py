@@ -119,6 +119,14 @@ def test_the_same_seed_gives_the_same_weights_and_leaves_others_numbers_alone(ba
     assert all(torch.equal(tensor, tensors[name]) for name, tensor in first.network.state_dict().items())
 
 
+@pytest.mark.parametrize("steps", [1, 9, 10, 20])
+def test_any_number_of_steps_can_be_taken(steps, batch):
+    imagined = TWIN.imagine_batch(batch[:2]), TWIN.imagine_batch(batch[2:4])
+    quick = replace(SMALL, min_steps=steps, epochs=1)
+    found = train_residual(batch[:2], batch[2:4], TWIN, quick, imagined=imagined)
+    assert all(torch.isfinite(tensor).all() for tensor in found.network.parameters())
+
+
 @pytest.mark.parametrize(
     "settings", [{"hidden": 0}, {"seed": -1}, {"learning_rate": 0.0}, {"weight_decay": -1.0}]
 )

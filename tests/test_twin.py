@@ -11,13 +11,13 @@ import pytest
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import PredictionError
 from foretrace.geometry import transform_points
-from foretrace.imagined import LEVELS, Scenes
-from foretrace.imagined.context import CONSTANTS
+from foretrace.imagined import LEVELS
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import ExecutionOffset, Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Box, Cylinder, ObjectModel, Prism, Weighted, sample_dented, sample_prism
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.randomisation import Randomisation
 from foretrace.trajectories import mean_distance
 from foretrace.twin import TwinCalibration, TwinConfig, TwinImaginer, worlds
 from foretrace.twin.gather import EDGES, gather
@@ -31,7 +31,7 @@ OWN = LeverUp((0.0, 0.0), (1.0, 0.0))
 """The action of a view, in its frame."""
 SAME = 2e-5
 """Contacts make this of the last bits of a pose that was worked out [m]."""
-TOLD = {"friction": 0.8, "tool_friction": 0.3, "density": 600.0}
+TOLD = {"friction": 0.8, "tool_friction": 0.3, "density": 600.0, "contact_error": 0.0}
 
 
 def lever(obj: ObjectModel, edge: int = 2, config: SimulationConfig = TOOL, **path: float) -> Interaction:
@@ -49,15 +49,6 @@ def made() -> list[Interaction]:
 @pytest.fixture(scope="module")
 def batch(made: list[Interaction]) -> InteractionBatch:
     return InteractionBatch.from_interactions(made)
-
-
-def told_nothing(batch: InteractionBatch) -> Scenes:
-    """The actions of a batch, of which no constant is told."""
-    values = [
-        np.full(len(batch), np.nan) if name in CONSTANTS else batch.parameters[name]
-        for name in TwinImaginer.context
-    ]
-    return Scenes(batch, batch.com[:, 0], np.stack(values, axis=1))
 
 
 def mirrored(batch: InteractionBatch) -> InteractionBatch:
@@ -121,7 +112,7 @@ def test_uneven_heights_are_pointed_out():
     view = TopDownView.of(PRISM, LeverUp.at_edge(PRISM, 0))
     height = view.height.copy()
     height[view.mask] *= np.linspace(0.4, 1.0, view.mask.sum())
-    imagined = TwinImaginer(config=CONFIG).imagine(TopDownView(view.mask, height), OWN, context=TOLD)
+    imagined = TwinImaginer(config=CONFIG).imagine(TopDownView(view.mask, height))
     assert any("flat top" in warning for warning in imagined.warnings)
 
 
@@ -235,9 +226,9 @@ def test_candidates_are_played_one_by_one():
         action = LeverUp.at_edge(PRISM, edge)
         point = transform_points(T, np.array([[*action.contact, 0.0]]))[0, :2]
         actions.append(LeverUp(point, T[:2, :2] @ action.direction))
-    many = twin.imagine_candidates(seen, actions, context=TOLD)
+    many = twin.imagine_candidates(seen, actions)
     for row, edge in enumerate((0, 2, 3)):
-        alone = twin.imagine(TopDownView.of(PRISM, LeverUp.at_edge(PRISM, edge)), OWN, context=TOLD)
+        alone = twin.imagine(TopDownView.of(PRISM, LeverUp.at_edge(PRISM, edge)))
         assert np.abs(many.com[row] - alone.com_trajectory).max() < 0.003
         assert many[row].futures.outcomes() == alone.futures.outcomes()
 
@@ -246,7 +237,7 @@ def test_candidates_are_played_one_by_one():
 
 
 def test_what_is_not_told_is_spread_over_futures(batch):
-    imagined = TwinImaginer(config=CONFIG).imagine_scenes(told_nothing(batch))
+    imagined = TwinImaginer(config=CONFIG).imagine_batch(batch, context="unknown")
     futures = imagined.futures
     assert futures.probability.sum(axis=1) == pytest.approx(1.0)
     assert (futures.probability >= 0).all()
@@ -259,10 +250,22 @@ def test_what_is_not_told_is_spread_over_futures(batch):
     assert (futures.spread.max(axis=(1, 2)) > 0.001).all()
 
 
+def test_futures_cover_a_constant_unless_it_is_told():
+    record = InteractionBatch.from_interactions([lever(PRISM, 1)])
+    config = replace(CONFIG, ranges=Randomisation(friction=(0.5, 1.1)), outline_noise=0.0)
+    twin = TwinImaginer(config=config)
+    told, hidden = {"friction": 0.8}, {"density": 600.0}
+    some, none = (twin.imagine_batch(record, context=each).futures.spread[0, 0] for each in (told, hidden))
+    assert some.max() < 1e-9
+    assert none.max() > 1e-4
+    assert np.isnan(twin.imagine_batch(record).futures.spread).all()
+
+
 def test_the_same_seed_gives_the_same_futures_and_another_one_others(batch):
-    scenes = told_nothing(batch[:2])
     first, again, other = (
-        TwinImaginer(config=replace(CONFIG, seed=seed)).imagine_scenes(scenes).futures.states
+        TwinImaginer(config=replace(CONFIG, seed=seed))
+        .imagine_batch(batch[:2], context="unknown")
+        .futures.states
         for seed in (1, 1, 2)
     )
     assert (first == again).all()
@@ -271,9 +274,10 @@ def test_the_same_seed_gives_the_same_futures_and_another_one_others(batch):
 
 def test_many_worlds_among_processes_are_the_same(batch, monkeypatch):
     monkeypatch.setattr(worlds, "MANY", 8)
-    scenes = told_nothing(batch[:2])
     here, there = (
-        TwinImaginer(config=replace(CONFIG, workers=workers)).imagine_scenes(scenes).futures
+        TwinImaginer(config=replace(CONFIG, workers=workers))
+        .imagine_batch(batch[:2], context="unknown")
+        .futures
         for workers in (1, 2)
     )
     assert (here.states == there.states).all()
@@ -283,10 +287,7 @@ def test_many_worlds_among_processes_are_the_same(batch, monkeypatch):
 @pytest.mark.parametrize("nothing", [False, True], ids=["told", "not told"])
 def test_mirror_images_have_mirrored_futures(batch, nothing):
     twin, image = TwinImaginer(config=CONFIG), mirrored(batch)
-    if nothing:
-        one, other = (twin.imagine_scenes(told_nothing(each)) for each in (batch, image))
-    else:
-        one, other = (twin.imagine_batch(each) for each in (batch, image))
+    one, other = (twin.imagine_batch(each, context="unknown" if nothing else None) for each in (batch, image))
     apart = np.linalg.norm(one.com - other.com * [1.0, -1.0, 1.0], axis=2).mean(axis=1)
     assert np.median(apart) < 0.0002
     assert np.abs(one.futures.probability - other.futures.probability).max() <= 0.25

@@ -49,6 +49,8 @@ SAME = 0.01
 """An input that varies by less counts as constant, and is only shifted."""
 FARTHEST = 3.0
 """Inputs further from the training part's mean than this are taken to be there [standard deviations]."""
+FEWEST_STEPS = 4
+"""A rate that rises and falls needs at least so many steps."""
 TURN_WEIGHT = 0.5
 """Weight of the turn in the loss, beside 1 for the displacement."""
 SCALE_WEIGHT = 0.02
@@ -387,7 +389,7 @@ def train_residual(
 
 def _fit(config: ResidualConfig, priors: Priors, residual: Tensor, valid: Tensor) -> ResidualNetwork:
     """Train a network."""
-    steps = max(config.min_steps, config.epochs * -(-len(priors) // config.batch_size))
+    steps = max(FEWEST_STEPS, config.min_steps, config.epochs * -(-len(priors) // config.batch_size))
     with seeded(config.seed, 0, torch.device("cpu")), thread_count(1):
         network = ResidualNetwork(config, residual.shape[1])
         network.prepare(priors, residual)
@@ -395,7 +397,11 @@ def _fit(config: ResidualConfig, priors: Priors, residual: Tensor, valid: Tensor
             network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, config.learning_rate, total_steps=steps, pct_start=0.1, cycle_momentum=False
+            optimizer,
+            config.learning_rate,
+            total_steps=steps,
+            pct_start=max(0.1, 2 / steps),
+            cycle_momentum=False,
         )
         for rows in _draws(len(priors), config.batch_size, steps):
             loss = network.loss(priors[rows], residual[rows], valid[rows])
