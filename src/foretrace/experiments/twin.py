@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter
 from tyro.conf import Fixed, Suppress
 
 from foretrace.errors import ResultsError, ViewError
@@ -235,6 +236,7 @@ class Twin(Experiment):
         ax.plot([], [], "_", color=INK, markersize=11, markeredgewidth=1.6, label="median")
         ax.set_xticks(range(len(summary)), [PARTS[part].replace(" held", "\nheld") for part in summary])
         ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         grid(ax, ylabel="error, full trajectory [cm]")
         fig.legend(loc="outside lower center", ncols=5)
         finish(
