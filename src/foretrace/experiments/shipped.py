@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from scipy.stats import rankdata
 
 from foretrace.errors import ResultsError, ViewError
 from foretrace.evaluation.charts import GREEN, SKY, VERMILLION, finish, grid
@@ -24,6 +25,7 @@ from foretrace.evaluation.tables import markdown_table, mean_with_interval, numb
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.transfer_objects import read_silhouettes
 from foretrace.imagined import STARTS, ImaginedBatch, Imaginer, Start, conformal_scores
+from foretrace.imagined.imaginer import UNSURE
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.pictures.style import new_figure, styled
@@ -151,11 +153,12 @@ class Shipped(Experiment):
             "constant": "brier_constant",
         }
         shares |= {"ECE": "ece", "ECE of edges": "ece_edge"}
+        doubts = {"Error above 1 cm": "wrong", "warned of one": "warned", "AUROC": "auroc"}
         held = {f"{level:.0%}": f"held_{level:g}" for level in SHOWN_LEVELS}
         for part, kinds in summary.items():
             count = next(iter(kinds.values()))["full"]["count"]
             lines.append(f"## {part.capitalize()}: {count:.0f} lever-ups")
-            for columns in (errors, shares, held | {"Radius at 50% [cm]": "radius_0.5"}):
+            for columns in (errors, shares | doubts, held | {"Radius at 50% [cm]": "radius_0.5"}):
                 table = [
                     [
                         kind,
@@ -244,7 +247,9 @@ def measure(imagined: ImaginedBatch, batch: InteractionBatch) -> Found:
         ``full`` and ``final``, means, and ``full_median``; with ``levered_`` in front, of those that were levered.
         ``right``: outcomes that were the most probable ones; ``f1_slipped``; ``brier`` and ``brier_constant`` of the
         shares of the outcomes; ``ece``: expected calibration error of the most probable outcome, ``ece_edge``: of the
-        pivot edge. ``held_``: motions that stay in regions; ``radius_0.5``: median radius at the end [cm].
+        pivot edge. ``wrong``: errors above a centimetre, ``warned``: expected to be, and ``auroc``: how well the
+        expected error tells them. ``held_``: motions that stay in regions; ``radius_0.5``: median radius at the end
+        [cm].
     """
     count = min(len(imagined.times), batch.com.shape[1])
     lengths = np.minimum(batch.length, count)
@@ -283,6 +288,10 @@ def measure(imagined: ImaginedBatch, batch: InteractionBatch) -> Found:
     single["ece"] = calibration_error(probability.max(axis=1), best == batch.outcome)
     edges = _edges(imagined, batch, levered)
     single |= {} if edges is None else {"ece_edge": calibration_error(*edges)}
+    error = np.asarray(METRICS["full"](imagined.com[:, :count], truth))
+    doubt, wrong = futures.expected_error(), error > UNSURE
+    if np.isfinite(doubt).all() and 0 < wrong.sum() < len(wrong):
+        single |= {"wrong": wrong.mean(), "warned": (doubt > UNSURE).mean(), "auroc": auroc(doubt, wrong)}
     if np.isfinite(futures.quantiles).any():
         cut = replace(futures, states=futures.states[:, :, :count], spread=futures.spread[:, :, :count])
         scores = conformal_scores(cut, np.nan_to_num(truth), lengths)
@@ -291,6 +300,12 @@ def measure(imagined: ImaginedBatch, batch: InteractionBatch) -> Found:
             note(f"held_{level:g}", (scores <= futures.width(level)).astype(float), every)
         single["radius_0.5"] = CM * float(np.median(futures.radius(0.5)[rows, likeliest, lengths - 1]))
     return found | {name: (float(value), np.nan, np.nan, len(batch)) for name, value in single.items()}
+
+
+def auroc(scores: Float[np.ndarray, " n"], positive: np.ndarray) -> float:
+    """Area under the receiver operating characteristic: chance that a positive has the higher score (Mann-Whitney)."""
+    ranks, count = rankdata(scores), int(positive.sum())
+    return float((ranks[positive].sum() - count * (count + 1) / 2) / (count * (len(scores) - count)))
 
 
 def calibration_error(confidence: Float[np.ndarray, " n"], right: np.ndarray) -> float:

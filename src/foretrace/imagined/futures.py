@@ -161,6 +161,16 @@ class Futures:
             spread=np.concatenate([np.zeros_like(self.spread[:, :, :k]), rest], axis=2),
         )
 
+    def expected_error(self) -> Float[np.ndarray, " batch"]:
+        """Expected distance of the most probable future from the motion, mean over time [m]; NaN: unknown.
+
+        Each future counts by its probability: with its distance from the most probable one, and its own spread.
+        """
+        rows = np.arange(len(self))
+        best = self.com[rows, self.probability.argmax(axis=1)]
+        apart = np.linalg.norm(self.com - best[:, None], axis=-1)
+        return (self.probability * np.hypot(apart, self.spread).mean(axis=2)).sum(axis=1)
+
     def outcomes(self) -> dict[str, Float[np.ndarray, " batch"]]:
         """Probability of each outcome."""
         names = dict.fromkeys(self.outcome)

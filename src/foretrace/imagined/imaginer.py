@@ -45,6 +45,11 @@ Start = Literal["observed", "estimated"]
 STARTS: tuple[Start, ...] = ("observed", "estimated")
 
 
+UNSURE = 0.01
+"""A prediction whose expected error is larger is pointed out [m]."""
+UNSURE_OF = "an error of {:.2g} cm is expected: several motions are likely, or the object is unlike those learned from"
+
+
 @dataclass(frozen=True)
 class Scenes:
     """What is to be imagined, checked; one row for each action."""
@@ -254,7 +259,9 @@ class Imaginer(ABC):
         imagined = self.imagine_scenes(scenes)
         about_objects = imagined.warnings or ((),) * len(scenes)
         about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(scenes)
-        warnings = tuple(a + b for a, b in zip(about_objects, about_paths, strict=True))
+        errors = imagined.futures.expected_error()
+        unsure = [(UNSURE_OF.format(100 * error),) if error > UNSURE else () for error in errors]
+        warnings = tuple(a + b + c for a, b, c in zip(about_objects, about_paths, unsure, strict=True))
         return replace(
             imagined, warnings=warnings, context=dict(zip(self.context, scenes.context.T, strict=True))
         )
