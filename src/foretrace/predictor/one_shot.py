@@ -51,6 +51,8 @@ SAME = 0.01
 """A value relative to edges that varies by less (a millimetre, half a degree) counts as constant."""
 LARGEST_ERROR = 1.5
 """Logarithm of the largest error scale, in units of the position's: outputs for improbable futures are arbitrary."""
+SMALLEST_ERROR = -15.0
+"""Logarithm of the smallest error scale that is learned: below, its likelihood would overflow for an odd lever-up."""
 DISAGREEMENT = 8.0
 """Error scale per distance between the outputs of networks and mirror images.
 
@@ -232,7 +234,7 @@ class OneShotPredictor(EffectPredictor):
         error = (apart * valid[:, None, None]).sum(dim=-1) / valid.sum(dim=-1).clamp(min=1)[:, None, None]
         log_probability = outputs.logits.flatten(3).log_softmax(dim=-1).view_as(outputs.logits)
         likelihood = log_probability.gather(4, chosen)[..., 0] - error / TEMPERATURE
-        expected = outputs.error.gather(4, chosen)[..., 0]
+        expected = outputs.error.gather(4, chosen)[..., 0].clamp(min=SMALLEST_ERROR)
         share = likelihood.softmax(dim=-1).detach()
         off = (error / scale).detach().clamp(min=1e-6)
         scale_loss = (share * (expected + off * torch.exp(-expected))).sum(dim=-1)
