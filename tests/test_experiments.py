@@ -40,7 +40,7 @@ from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.stand_in import StandIn
-from foretrace.twin.residual import ResidualConfig
+from foretrace.twin.residual_network import ResidualConfig
 
 QUIET = Console(quiet=True)
 RECORDINGS = Path(__file__).parents[1] / "examples" / "replay_recording" / "recordings.json"

@@ -14,7 +14,8 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.objects import sample_prism
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.twin import TwinConfig, TwinImaginer
-from foretrace.twin.residual import ResidualConfig, ResidualImaginer, train_residual
+from foretrace.twin.residual import ResidualImaginer, train_residual
+from foretrace.twin.residual_network import ResidualConfig
 
 TWIN = TwinImaginer(config=TwinConfig(workers=1, worlds=4))
 SMALL = ResidualConfig(hidden=16, layers=2, ensemble=2, components=8, epochs=40, min_steps=200)

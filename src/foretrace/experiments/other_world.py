@@ -35,7 +35,8 @@ from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.predictor.states import valid_samples
 from foretrace.twin import TwinConfig, TwinImaginer
-from foretrace.twin.residual import ResidualConfig, train_residual
+from foretrace.twin.residual import train_residual
+from foretrace.twin.residual_network import ResidualConfig
 
 METHODS = {
     "learned alone": SKY,
@@ -205,6 +206,8 @@ class OtherWorld(Experiment):
         ax.set_xticks(list(place.values()), [str(count) for count in place])
         ax.set_yticks(ticks := [0.05, 0.1, 0.2, 0.5, 1.0], [f"{tick:g}" for tick in ticks])
         ax.minorticks_off()
+        means = [each["full_mean"]["mean"] for found in summary.values() for each in found.values()]
+        ax.set_ylim(0.6 * min(means), 1.5 * max(means))  # intervals of two seeds would stretch it
         grid(ax, xlabel="real lever-ups learned from", ylabel="error, full trajectory [cm]")
         fig.legend(loc="outside lower center", ncols=1)
         seeds = max(each["seeds"] for found in summary.values() for each in found.values())
