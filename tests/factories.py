@@ -146,3 +146,8 @@ def _turn(start: np.ndarray, end: np.ndarray, angles: np.ndarray) -> np.ndarray:
     pivot = np.append(start, 0.0)
     motion[:, :3, 3] = pivot - motion[:, :3, :3] @ pivot
     return motion
+
+
+def besides_doubt(warnings):
+    """Warnings without those about an expected error: predictors of tests have hardly learned."""
+    return tuple(line for line in warnings if not line.startswith("an error of"))

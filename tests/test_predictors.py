@@ -7,12 +7,13 @@ import pytest
 import torch
 import tyro
 
-from factories import fake_batch, fake_interactions
+from factories import besides_doubt, fake_batch, fake_interactions
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import ImaginedBatch
 from foretrace.imagined.context import CONSTANTS
+from foretrace.imagined.imaginer import UNSURE, UNSURE_OF
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import TopDownView
@@ -121,7 +122,7 @@ def test_shapes_frames_and_probabilities(predictor, batch):
         np.testing.assert_allclose(turned[:, 0], np.broadcast_to(np.eye(3), (n, 3, 3)), atol=0.01)
         rows = np.arange(n), futures.probability.argmax(axis=1)
         np.testing.assert_allclose(quaternion_to_matrix(futures.pose[rows][..., 3:]), turned, atol=1e-6)
-    assert imagined.warnings == ((),) * n
+    assert [besides_doubt(said) for said in imagined.warnings] == [()] * n
 
 
 def test_batch_singles_and_candidates_are_the_same(predictor, batch):
@@ -202,6 +203,15 @@ def test_an_object_that_is_unusual_is_pointed_out_at_every_door(predictor):
         assert imagined.warnings == (one,)
 
 
+def test_an_expected_error_of_a_centimetre_is_pointed_out(predictor, batch):
+    imagined = predictor.imagine_batch(batch)
+    errors = imagined.futures.expected_error()
+    for error, said in zip(errors, imagined.warnings, strict=True):
+        doubts = [line for line in said if line.startswith("an error of")]
+        assert doubts == [UNSURE_OF.format(100 * error)] * bool(error > UNSURE)
+    assert np.isnan(errors).all() == imagined.futures.is_point
+
+
 def test_a_path_that_is_not_nominal_is_pointed_out_at_every_door(predictor, batch):
     action = replace(OWN, path=ToolPath(sweep=0.5).faster(1.2))
     view = view_of(batch, 4)
@@ -214,14 +224,17 @@ def test_a_path_that_is_not_nominal_is_pointed_out_at_every_door(predictor, batc
         for name, value in names.items()
         if name not in predictor.context
     ]
-    assert list(one.warnings) == expected
+    assert list(besides_doubt(one.warnings)) == expected
     seen = with_parameters(InteractionBatch.from_views([view]), context | names)
     assert predictor.imagine_batch(seen, "estimated").warnings == (one.warnings,)
     candidates = predictor.imagine_candidates(view, [action, OWN], context=context)
-    assert candidates.warnings == (one.warnings, ())
+    assert candidates.warnings[0] == one.warnings
+    assert besides_doubt(candidates.warnings[1]) == ()
     np.testing.assert_allclose(candidates.com[0], one.com_trajectory, atol=2e-6)
     steep = predictor.imagine(view, replace(OWN, path=ToolPath(pitch=0.35)), context=context).warnings
-    assert steep == ("pitch 0.35 is not the nominal 0.28, and the predictor is not conditioned on it",)
+    assert besides_doubt(steep) == (
+        "pitch 0.35 is not the nominal 0.28, and the predictor is not conditioned on it",
+    )
     if "sweep" in predictor.context:
         with pytest.raises(
             PredictionError, match=r"context sweep is 0.9, the action's path has 0.5: give one"
