@@ -21,7 +21,7 @@ from foretrace.errors import ResultsError
 from foretrace.evaluation.charts import GREEN, ORANGE, SKY, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, chosen, kept_folder
 from foretrace.evaluation.metrics import METRICS
-from foretrace.evaluation.statistics import interval
+from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.training import Recipe, load_levered
@@ -152,9 +152,9 @@ class OtherWorld(Experiment):
             for count in sorted(int(number) for number in set(mine["lever_ups"])):
                 there = mine.loc[mine["lever_ups"].eq(count)]
                 found: dict[str, Any] = {"seeds": int(there["seed"].nunique())}
+                ratio = PAPER_SIZES[2] / count if count else TEST_TO_TRAIN
                 for metric, values in there.groupby("metric", sort=False)["value"]:
-                    # Of the independent draws of a few training interactions, the test parts overlap little.
-                    found[str(metric)] = interval(values).as_dict(5)
+                    found[str(metric)] = interval(values, ratio).as_dict(5)
                 summary.setdefault(method, {})[str(count)] = found
         return summary
 
