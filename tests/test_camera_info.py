@@ -75,6 +75,7 @@ def test_zeros_at_the_end_change_nothing() -> None:
         ({"width": 0, "height": 0}, "not calibrated .all zeros, 0 x 0"),
         ({"k": [np.nan, *K[1:]]}, "fx = nan"),
         ({"k": [-500.0, *K[1:]]}, "fx = -500.0, it must be positive"),
+        ({"k": [*K[:4], 1e200, *K[5:]]}, r"fy = 1e\+200 pixels: at most 1e\+07 are believed"),
         ({"k": [1.0, 0, 0, 0, 1, 0, 0, 0, 1]}, "not calibrated .focal length of 1 pixels"),
         ({"k": [500.0, 3.0, *K[2:]]}, "skew is 3 pixels"),
         ({"d": LENS[:3]}, r"plumb_bob with coefficients \[-0.3, 0.1, 0.001\]: it has 4 or 5 or 8"),

@@ -136,7 +136,7 @@ def test_half_the_time_step_agrees() -> None:
     [
         ({"engine": "ode"}, "unknown engine 'ode'; available: mujoco"),
         ({"embodiment": "hand"}, "embodiment 'hand' is unknown: choose one of arm, tool"),
-        ({"camera": "fisheye"}, "camera 'fisheye' is unknown: choose one of exact, rgbd"),
+        ({"camera": "fisheye"}, "camera 'fisheye' is unknown: choose one of exact, grid, rgbd"),
         ({"timestep": 0.003}, r"timestep = 0\.003 s does not divide"),
     ],
 )

@@ -29,6 +29,8 @@ FISHEYE_SIZE = 4
 NO_RAY = -1e6
 """What its fisheye model gives where no ray leads to a pixel."""
 YAML = (".yaml", ".yml")
+LONGEST_FOCUS = 1e7
+"""Greatest focal length, and width and height of an image [pixel]: a telescope's."""
 MOST_PIXELS = 100_000
 """Most rows or columns of an image."""
 
@@ -76,6 +78,10 @@ class PinholeCamera:
             value = getattr(self, name)
             if not is_number(value) or not 0 < value < np.inf:
                 raise PerceptionError(f"camera: {name} = {shown(value)}, it must be positive")
+            if value > LONGEST_FOCUS:
+                raise PerceptionError(
+                    f"camera: {name} = {shown(value)} pixels: at most {LONGEST_FOCUS:g} are believed"
+                )
         for name, size in (("cx", self.width), ("cy", self.height)):
             if not is_number(getattr(self, name)) or not 0 <= getattr(self, name) < size:
                 raise PerceptionError(

@@ -35,6 +35,8 @@ RANGES = (
     "thickness_factor",
     "bevel_width_factor",
     "bevel_height_factor",
+    "com_offset",
+    "execution_share",
 )
 
 
