@@ -119,10 +119,8 @@ def fake_data_set(
         obj, action, seed = trial(config, id)
         outcome = Outcome.SLIPPED if id % (13 if drawn == NOTHING else 5) == 3 else Outcome.LEVERED
         made = fake_lever_up(obj, action, id=id, seed=seed, num_samples=num_samples, outcome=outcome)
-        rng = np.random.default_rng(id)
-        _, physics, path, error = config.randomisation.vary(obj, Physics(), ToolPath(), rng)
-        action = replace(made.action, path=path)
-        return replace(made, physics=physics, action=action, execution_error=error)
+        _, physics, path, _ = config.randomisation.vary(obj, Physics(), ToolPath(), np.random.default_rng(id))
+        return replace(made, physics=physics, action=replace(made.action, path=path))
 
     collect(config, folder, workers=1, console=Console(quiet=True), simulate=simulate)
     return folder
