@@ -145,7 +145,7 @@ def test_predict_tells_of_futures(run: Path, picture: Path, tmp_path: Path, caps
     content = json.loads((tmp_path / "trajectory.json").read_text())
     assert content["com_trajectory"] == content["futures"][0]["com_trajectory"]
     assert len(content["futures"]) == 4
-    assert content["warnings"] == []
+    assert besides_doubt(content["warnings"]) == ()
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
 
 
@@ -171,7 +171,7 @@ def test_the_shipped_predictor_tells_what_becomes_of_a_box(edge: int, outcome: s
     predictor = ft.load_predictor()
     box = ft.Box(0.14, 0.1, 0.02)
     imagined = predictor.imagine(ft.TopDownView.of(box, ft.LeverUp.at_edge(box, edge)))
-    assert imagined.warnings == ()
+    assert besides_doubt(imagined.warnings) == ()
     assert imagined.futures is not None
     probability = {name: float(p[0]) for name, p in imagined.futures.outcomes().items()}
     assert max(probability, key=lambda name: probability[name]) == outcome
