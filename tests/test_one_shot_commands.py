@@ -14,6 +14,7 @@ import torch
 import factories
 import foretrace as ft
 from export_samples import write_data
+from factories import besides_doubt
 from foretrace import cli
 from foretrace.cli.futures import futures_content, prediction_band, radius_of, say_futures
 from foretrace.errors import CheckpointError
