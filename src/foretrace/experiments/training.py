@@ -22,7 +22,7 @@ from foretrace.predictor import (
     fit_predictor,
     train_predictor,
 )
-from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.predictor.checkpoint import ADDED, default_checkpoint
 from foretrace.predictor.run_folder import MODEL, Progress
 from foretrace.predictor.states import valid_lengths
 from foretrace.predictor.training import RUNTIME
@@ -81,7 +81,9 @@ class Recipe:
     def describe(self) -> dict[str, Any]:
         """What decides the weights beside data and trial, JSON-able."""
         predictor, training = asdict(self.predictor), asdict(self.training)
-        left_out = {*OF_THE_TRIAL, *RUNTIME}
+        # A setting that is younger than kept results is named only where it is not what it was for these.
+        unchanged = {name for name in ADDED if predictor[name] == getattr(type(self.predictor), name)}
+        left_out = {*OF_THE_TRIAL, *RUNTIME, *unchanged}
         return {
             "predictor": {name: value for name, value in predictor.items() if name not in left_out},
             "training": {name: value for name, value in training.items() if name not in left_out},
