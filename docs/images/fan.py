@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from foretrace.cli.futures import percentage
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
@@ -59,8 +60,11 @@ def main() -> None:
             interaction = dataset.with_id(int(test.ids[row]))
             draw(ax, interaction, imagined[row])
             title = f"{interaction.effect.outcome}, {NAMES[place]}: {100 * errors[row]:.2f} cm"
-            ax.set_title(f"{title}\n", fontsize=11.5, loc="left", fontweight="bold")
-            ax.text(0, 1.03, told(imagined[row]), transform=ax.transAxes, fontsize=9.5, color=PREDICTED)
+            ax.set_title(f"{title}\n", fontsize=10.5, loc="left", fontweight="bold")
+            said = ax.text(
+                0, 1.03, told(imagined[row]), transform=ax.transAxes, fontsize=9.5, color=PREDICTED
+            )
+            said.set_in_layout(False)
         handles = [
             Line2D([], [], color=TRUTH, lw=2.2, label="what happened"),
             Line2D([], [], color=PREDICTED, lw=2, label="most probable future"),
@@ -78,10 +82,9 @@ def main() -> None:
 
 
 def told(effect: ImaginedEffect) -> str:
-    """What was said of the outcome."""
-    assert effect.futures is not None
-    found = effect.futures.outcomes().items()
-    return "said: " + ", ".join(f"{name} {100 * p[0]:.0f} %" for name, p in found if p[0] >= 0.01)
+    """The two most probable outcomes."""
+    found = sorted(((float(p[0]), name) for name, p in effect.futures.outcomes().items()), reverse=True)
+    return "predicted: " + ", ".join(f"{name} {percentage(p)}" for p, name in found[:2] if p >= 0.01)
 
 
 def draw(ax: Axes, interaction: Interaction, effect: ImaginedEffect) -> None:

@@ -37,10 +37,10 @@ CM = 100.0
 RUNTIME_OPTIONS = ("min_steps", "device", "precision", "threads")
 """Settings of a training that the card's command leaves at their defaults."""
 LIMITS = """\
-- It imagines lever-ups with the tool path of its data, on rigid objects that lie alone on a flat table.
+- It imagines lever-ups with tool paths like those of its data, on rigid objects that lie alone on a flat table.
 - It has learned from simulation. How far a real object is from it is not part of this card.
 - Probabilities and regions hold for lever-ups like those in the data: an object that is unlike them is pointed out, an
-  unlike friction, density, rim or tool is not.
+  unlike friction, density, rim or tool is not. From a view alone they are those of objects of uniform density.
 - A view that shows several objects, none, or no contact at the object's rim is refused."""
 
 
