@@ -5,7 +5,6 @@ python examples/run_onnx.py [model.onnx]; by default the predictor that comes wi
 
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,7 +14,7 @@ import onnxruntime
 import foretrace as ft
 from foretrace.export.onnx import export_onnx
 from foretrace.features import FEATURES, make_features
-from foretrace.imagined.context import nominal_parameters
+from foretrace.imagined.context import nominal_constants, nominal_parameters
 from foretrace.interactions.dataset import InteractionBatch
 
 prism = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)], height=0.02)
@@ -32,7 +31,7 @@ with TemporaryDirectory() as folder:
     except Exception:  # onnxruntime's have no class in common
         sys.exit(f"{file} is missing or no predictor: give a file that `foretrace export onnx` wrote")
 x, y = view.to_metres(np.argwhere(view.mask).mean(axis=0)[None])[0]
-usual = asdict(ft.Physics()) | dict(nominal_parameters())
+usual = dict(nominal_constants()) | dict(nominal_parameters())
 inputs = {
     "mask": view.mask[None].astype(np.uint8),
     "height": view.height[None].astype(np.float32),

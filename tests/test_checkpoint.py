@@ -1,17 +1,15 @@
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-import foretrace as ft
 from factories import fake_batch
 from foretrace.errors import CheckpointError
 from foretrace.features import FEATURES
-from foretrace.predictor import LstmConfig, LstmPredictor, load_predictor, save_checkpoint
+from foretrace.predictor import LstmConfig, LstmPredictor, OneShotConfig, load_predictor, save_checkpoint
 from foretrace.predictor.checkpoint import read_config
 
 
@@ -164,18 +162,23 @@ def test_odd_settings_are_refused(saved, change, message):
 
 
 def test_files_of_version_1_are_read(tmp_path, batch):
-    shipped = Path(ft.__file__).parent / "predictor" / "default"
+    shipped = tmp_path / "new"
+    made = OneShotConfig(feature_options={"heights": True}, hidden=8, ensemble=2, components=4).make(20)
+    save_checkpoint(shipped, made.eval(), {"epochs": 3})
     shutil.copy(shipped / "model.safetensors", tmp_path)
     content = json.loads((shipped / "config.json").read_text())
     config = content.pop("config")
     features = {"label": config.pop("features"), "options": config.pop("feature_options")}
     names = {"ensemble": "members", "components": "motions", "pivot_edges": "hinges"}
-    settings = {names.get(name, name): value for name, value in config.items() if name != "context"}
+    later = ("context", "hidden_share")
+    settings = {names.get(name, name): value for name, value in config.items() if name not in later}
     training = content["training"] | {"state": "position", "window": 15}
     del content["outcomes"]
     old = content | {"version": 1, "settings": settings, "features": features, "training": training}
     (tmp_path / "config.json").write_text(json.dumps(old))
-    assert read_config(tmp_path) == read_config(shipped)
+    expected = read_config(shipped)
+    assert expected["config"].pop("hidden_share") == 0.0
+    assert read_config(tmp_path) == expected
     found, expected = (load_predictor(path).imagine_batch(batch, "estimated") for path in (tmp_path, shipped))
     np.testing.assert_array_equal(found.com, expected.com)
     for damaged in ({"settings": None}, {"features": {"label": "outline"}}):

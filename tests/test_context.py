@@ -295,7 +295,10 @@ def test_none_is_nominal_and_a_mapping_tells_what_it_names(marginal, batch):
     by_default, told = (marginal.imagine(view, context=context) for context in (None, nominal))
     np.testing.assert_array_equal(by_default.com_trajectory, told.com_trajectory)
     assert by_default.context == nominal
-    assert "told friction 0.8, density 600, contact_error 0" in repr(by_default)
+    assert "nominal physics" in repr(by_default)
+    assert "told friction 0.7, not told density, contact_error" in repr(
+        marginal.imagine(view, context={"friction": 0.7})
+    )
     some, nothing, empty = (
         marginal.imagine(view, context=context) for context in ({"friction": 0.8}, "unknown", {})
     )

@@ -43,7 +43,7 @@ def test_wrong_types_are_named_with_the_remedy():
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     errors, imagined = done.stdout.rsplit("ImaginedEffect", 1)
     assert errors == EXPECTED
-    assert imagined.startswith("(90 samples, levered ")
+    assert imagined.startswith("(113 samples, levered ")
     assert len(imagined) < 120
 
 

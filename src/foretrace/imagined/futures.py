@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from foretrace.errors import PredictionError
 from foretrace.geometry import rotation_vector_to_quaternion
+from foretrace.imagined.context import CONSTANTS, nominal_constants
 from foretrace.interactions.record import Outcome
 
 LEVELS = np.arange(1, 100) / 100
@@ -228,11 +229,13 @@ class ImaginedEffect:
             f"{name} {float(chance[0]):.3g}" for name, chance in self.futures.outcomes().items()
         )
         warned = f", {len(self.warnings)} warnings" if self.warnings else ""
-        told = [f"{name} {value:.4g}" for name, value in self.context.items() if not np.isnan(value)]
-        hidden = [name for name, value in self.context.items() if np.isnan(value)]
-        told = f", told {', '.join(told)}" if told else ""
-        hidden = f", not told {', '.join(hidden)}" if hidden else ""
-        return f"ImaginedEffect({len(self.times)} samples, {chances}{told}{hidden}{warned})"
+        physics = {name: value for name, value in self.context.items() if name in CONSTANTS}
+        told = [f"{name} {value:.4g}" for name, value in physics.items() if not np.isnan(value)]
+        hidden = [name for name, value in physics.items() if np.isnan(value)]
+        words = [f"told {', '.join(told)}"] * bool(told) + [f"not told {', '.join(hidden)}"] * bool(hidden)
+        if physics and all(value == nominal_constants()[name] for name, value in physics.items()):
+            words = ["nominal physics"]
+        return f"ImaginedEffect({', '.join([f'{len(self.times)} samples', chances, *words])}{warned})"
 
 
 @dataclass(frozen=True)
