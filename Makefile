@@ -32,7 +32,7 @@ $(STAMP): pyproject.toml requirements.lock constraints.txt
 # machines with a GPU are left out.
 lock:
 	$(BIN)/pip install --quiet uv
-	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --python-version 3.11.5 --generate-hashes \
+	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --python-version 3.11.0 --generate-hashes \
 		--constraint constraints.txt --no-emit-package torch --no-annotate --no-header --quiet \
 		--output-file requirements.lock
 	sed -i -e ':join' -e '/\\$$/{N;s/ *\\\n */ /;bjoin}' requirements.lock
