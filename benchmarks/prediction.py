@@ -32,9 +32,9 @@ def seconds(work: Callable[[], object], repeats: int = 1) -> float:
     return (time.process_time() - start) / repeats
 
 
-def all_futures(predictor: OneShotPredictor, view: TopDownView, context: dict[str, float]) -> np.ndarray:
+def all_futures(predictor: OneShotPredictor, view: TopDownView) -> np.ndarray:
     """Whole motions of all futures, including the poses, which are computed on demand."""
-    return predictor.imagine(view, context=context).futures.pose
+    return predictor.imagine(view).futures.pose
 
 
 def candidates_of(prism: Prism, first: LeverUp, rng: np.random.Generator) -> list[LeverUp]:
@@ -62,9 +62,8 @@ def main() -> None:
         actions = sample_contacts(prism, rng, per_edge=2)
         view = TopDownView.of(prism, actions[0])
         candidates = candidates_of(prism, actions[0], rng)
-        context = dict.fromkeys(predictor.context, 0.5)
-        one = seconds(lambda: all_futures(predictor, view, context), 20)  # noqa: B023
-        many = seconds(lambda: predictor.imagine_candidates(view, candidates, context=context), 2)  # noqa: B023
+        one = seconds(lambda: all_futures(predictor, view), 20)  # noqa: B023
+        many = seconds(lambda: predictor.imagine_candidates(view, candidates), 2)  # noqa: B023
         simulated = [
             seconds(lambda: simulate_lever_up(prism, action, SimulationConfig(embodiment="tool")))  # noqa: B023
             for action in actions[:SIMULATED]
