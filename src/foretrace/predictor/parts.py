@@ -90,8 +90,8 @@ def _estimated_com(source: InteractionBatch) -> np.ndarray:
 def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
     columns: dict[str, np.ndarray] = {}
     measures: dict[str, np.ndarray] = {}
-    done = 0
-    for batch in source.batches():
+    order, done = np.argsort(source.ids, kind="stable"), 0  # as they lie on disk: each shard is read once
+    for batch in source[order].batches():
         piece = prepare(batch, predictor)
         own = {
             "inputs": piece.inputs.numpy(),
@@ -104,7 +104,7 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
         for whole, found in ((columns, own), (measures, piece.measures)):
             for name, values in found.items():
                 column = whole.setdefault(name, np.empty((len(source), *values.shape[1:]), values.dtype))
-                column[done : done + len(batch)] = values
+                column[order[done : done + len(batch)]] = values
         done += len(batch)
     inputs = torch.from_numpy(columns.pop("inputs"))
     return Part(source, inputs, measures=measures, **columns)
