@@ -424,3 +424,26 @@ def test_so_many_epochs_as_are_asked_for(tmp_path, folder, capsys):
     assert "epoch 2/2" in capsys.readouterr().out
     assert cli.main([*train, "--out", str(tmp_path / "none"), "--outcomes", "rolled"]) == 2
     assert "no interaction has an outcome among rolled; the data has: levered" in capsys.readouterr().err
+
+
+ENDING = """
+import sys, threading, time
+from foretrace import cli
+threading._register_atexit(lambda: (print("ending", flush=True), time.sleep(30)))  # as loky waits for its workers
+sys.argv = ["foretrace", "--version"]
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_ctrl_c_after_the_work_ends_the_process_without_a_word():
+    process = subprocess.Popen(
+        [sys.executable, "-c", ENDING], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    while process.stdout.readline().strip() != "ending":
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == -signal.SIGINT
+    assert errors == ""

@@ -81,6 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return _run(sys.argv[1:] if arguments is None else arguments)
         finally:
+            if arguments is None:
+                _end_at_once()
             sys.stdout.flush()
     except BrokenPipeError:
         # Python's own flush at exit would complain.
@@ -92,6 +94,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(end.__context__, BrokenPipeError):  # rich has silenced itself, with exit status 1
             return OUTPUT_CLOSED
         raise
+
+
+def _end_at_once() -> None:
+    """Let a signal end the process without a word: the command is done, and Python waits for the end of its workers."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
 
 
 def read(arguments: Sequence[str]) -> Ready:
