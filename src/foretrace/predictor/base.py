@@ -333,10 +333,10 @@ class EffectPredictor(Imaginer, nn.Module):
         self, inputs: Float[Tensor, "batch inputs"], hidden: Bool[Tensor, "batch optional"]
     ) -> Float[Tensor, "batch inputs"]:
         """Inputs of which the given constants are hidden."""
-        inputs, first = inputs.clone(), self.features.num_features
-        for k, column in enumerate([first + column for column in self.optional]):
-            inputs[:, column] *= ~hidden[:, k]
-        inputs[:, inputs.shape[1] - len(self.optional) :] *= ~hidden
+        inputs, number = inputs.clone(), len(self.optional)
+        values = [self.features.num_features + column for column in self.optional]
+        flags = range(inputs.shape[1] - number, inputs.shape[1])
+        inputs[:, [*values, *flags]] *= ~hidden.repeat(1, 2)
         return inputs
 
     @final

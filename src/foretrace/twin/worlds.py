@@ -21,13 +21,11 @@ from foretrace.interactions.record import NO_OFFSET, ExecutionOffset, Physics
 from foretrace.objects import ObjectModel, Prism, Weighted
 from foretrace.simulation.engine import make_engine
 from foretrace.simulation.lever_up import effect_of
-from foretrace.simulation.randomisation import Randomisation, reshaped
+from foretrace.simulation.randomisation import CONSTANTS, FACTORS, Randomisation, reshaped
 from foretrace.workers import run_jobs
 
 WAVES = 3
 """Waves round an outline that noise of it consists of: the same all round, a shift, an ellipse, a triangle."""
-FACTORS = ("thickness_factor", "bevel_width_factor", "bevel_height_factor")
-CONSTANTS = ("friction", "tool_friction", "density")
 OFFSETS = ("execution_ahead", "execution_left", "execution_turn")
 NAMES = (*CONSTANTS, *FACTORS, *OFFSETS, *(f"wave {k}" for k in range(2 * WAVES + 1)))
 """What is drawn, column by column."""
