@@ -9,6 +9,7 @@ from rich.console import Console
 import factories
 from engines_at_hand import WITHOUT_BULLET
 from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.cli import main
 from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError
 from foretrace.geometry import transform_points
@@ -27,7 +28,6 @@ from foretrace.simulation.randomisation import (
     NOTHING,
     RANDOMISED,
     RANGES,
-    VARIED_ACTION,
     Randomisation,
 )
 

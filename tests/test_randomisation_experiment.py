@@ -8,6 +8,7 @@ from rich.console import Console
 
 import factories
 from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import DatasetError, ResultsError
 from foretrace.evaluation.run import run_experiment
 from foretrace.experiments import randomisation
@@ -26,7 +27,7 @@ from foretrace.imagined import Futures, ImaginedBatch
 from foretrace.imagined.context import PARAMETERS
 from foretrace.objects.everyday import PENTAGON
 from foretrace.predictor import LstmConfig
-from foretrace.simulation.randomisation import RANDOMISED, VARIED_ACTION, Randomisation
+from foretrace.simulation.randomisation import RANDOMISED, Randomisation
 from foretrace.simulation.stand_in import StandIn
 
 QUIET = Console(quiet=True)

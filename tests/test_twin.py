@@ -13,6 +13,7 @@ from foretrace.errors import PredictionError
 from foretrace.geometry import transform_points
 from foretrace.imagined import LEVELS
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.outline import count_contradictions, fit_outline
 from foretrace.interactions.record import ExecutionOffset, Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Box, Cylinder, ObjectModel, Prism, Weighted, sample_dented, sample_prism
@@ -21,7 +22,7 @@ from foretrace.simulation.randomisation import Randomisation
 from foretrace.trajectories import mean_distance
 from foretrace.twin import TwinCalibration, TwinConfig, TwinImaginer, worlds
 from foretrace.twin.gather import EDGES, gather
-from foretrace.twin.outline import count_contradictions, fit_outline, locate_object, match_corners, see_object
+from foretrace.twin.outline import locate_object, match_corners, see_object
 from foretrace.twin.worlds import MIRRORED, NAMES, Played, draw_shares
 
 CONFIG = TwinConfig(worlds=8, workers=1)

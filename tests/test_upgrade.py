@@ -10,6 +10,7 @@ import pytest
 
 import factories
 from foretrace.actions import ToolPath
+from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import DatasetError
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.dataset import Dataset
@@ -18,7 +19,7 @@ from foretrace.interactions.record import Interaction
 from foretrace.interactions.upgrade import upgrade
 from foretrace.simulation.collect import CollectConfig, collect, simulate_trial
 from foretrace.simulation.lever_up import SimulationConfig
-from foretrace.simulation.randomisation import RANDOMISED, VARIED_ACTION
+from foretrace.simulation.randomisation import RANDOMISED
 
 GOLDEN = Path(__file__).parent / "golden" / "version-1"
 """Written by the last foretrace that wrote version 1: a random cylinder, levered four times."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         paper_objects,
         sample_prism,
     )
+    from foretrace.planning import Plan, PlanConfig, goals, plan
     from foretrace.predictor import (
         EffectPredictor,
         LstmConfig,
@@ -51,6 +52,7 @@ _HOMES = {
         *("paper_objects", "sample_prism"),
     ),
     "foretrace.features": ("FeatureExtractor",),
+    "foretrace.planning": ("Plan", "PlanConfig", "goals", "plan"),
     "foretrace.predictor": (
         *(
             "EffectPredictor",
@@ -88,6 +90,8 @@ __all__ = [
     "OneShotConfig",
     "Outcome",
     "Physics",
+    "Plan",
+    "PlanConfig",
     "PredictorConfig",
     "Prism",
     "SimulationConfig",
@@ -98,8 +102,10 @@ __all__ = [
     "TwinImaginer",
     "Weighted",
     "collect",
+    "goals",
     "load_predictor",
     "paper_objects",
+    "plan",
     "replay",
     "sample_prism",
     "simulate",

@@ -74,6 +74,10 @@ class PredictionError(ForetraceError):
     """An input that the predictor cannot imagine an effect for."""
 
 
+class PlanningError(ForetraceError):
+    """A goal that cannot be planned for: no contact is free, nothing is asked for, a value is out of its range."""
+
+
 class ResultsError(ForetraceError):
     """Results that are missing, damaged or of another version, data set or recipe; an experiment that is unknown."""
 

@@ -130,6 +130,14 @@ class ToolPath:
         return cls(**settings).faster(speed)
 
 
+VARIED_ACTION = {
+    "insertion": (0.012, 0.03),
+    "arc_radius": (0.10, 0.18),
+    "sweep": (0.45, 1.0),
+    "speed": (2 / 3, 1.5),
+}
+"""Ranges of a path's parameters around the nominal ones, within the arm's reach and speed: what
+``foretrace simulate --vary-action`` draws from, and a planner that may vary the path."""
 NOMINAL_TIME = ToolPath.insert_time + ToolPath.lift_time
 """Time in which the nominal path is pushed in and lifted [s]."""
 

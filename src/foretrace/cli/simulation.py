@@ -6,11 +6,12 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
+from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.cli.parsing import adapt
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
-from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED, VARIED_ACTION
+from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED
 
 ROLLING_TIME = 1.5
 """Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""

@@ -14,11 +14,12 @@ from foretrace.imagined.futures import (
     conformal_scores,
     quantiles_of,
 )
-from foretrace.imagined.imaginer import STARTS, Imaginer, Scenes, Start
+from foretrace.imagined.imaginer import IMAGINERS, STARTS, Imaginer, Scenes, Start
 from foretrace.imagined.observed import ObservedMotion
 
 __all__ = [
     "FLOOR",
+    "IMAGINERS",
     "LEVELS",
     "MIN_PROBABILITY",
     "STARTS",

@@ -1,7 +1,7 @@
 """Views that an imaginer accepts, and warnings about objects that are unlike those it has learned from."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -145,41 +145,75 @@ def check_contacts(
         PredictionError: The object lies behind the contact point, away from it, around it, or beyond the window of
             the action's view.
     """
-    rim = _rim(mask)
-    rows, columns = mask.sum(axis=1), mask.sum(axis=0)
-    middle = np.array([rows @ np.arange(len(rows)), columns @ np.arange(len(columns))]) / rows.sum()
-    ahead = ((CONTACT_PIXEL - middle) * METRES_PER_PIXEL - contacts) * directions
-    for name, distance in zip(names, ahead.sum(axis=1), strict=True):
+    faults = _find_faults(mask, contacts, directions)
+    for name, distance in zip(names, faults.ahead, strict=True):
         if distance <= 0:
             raise PredictionError(
                 f"{name}the object lies behind the contact point, its middle by {-100 * distance:.1f} cm: turn "
                 "the action's direction round"
             )
-    x, y = _along(rim, contacts, directions)
-    apart = np.sqrt((x * x + y * y).min(axis=1))
-    apart[_look_up(mask, contacts)] = 0.0
-    for name, gap in zip(names, apart, strict=True):
+    for name, gap in zip(names, faults.apart, strict=True):
         if gap > LARGEST_GAP + METRES_PER_PIXEL / 2:
             raise PredictionError(
                 f"{name}the contact point is {100 * gap:.1f} cm from the object, more than "
                 f"{100 * LARGEST_GAP:.0f} cm: choose one at its rim"
             )
+    if faults.inside.any():
+        raise PredictionError(
+            f"{names[int(faults.inside.argmax())]}the contact point lies in the object, which is still there "
+            f"{100 * LARGEST_GAP:.0f} cm behind it: choose one at its rim"
+        )
+    if faults.cut.any():
+        raise PredictionError(
+            f"{names[int(faults.cut.argmax())]}the object reaches beyond the view from that contact point: choose "
+            "another one"
+        )
+
+
+def find_usable_contacts(
+    mask: Bool[np.ndarray, "128 128"],
+    contacts: Float[np.ndarray, "n 2"],
+    directions: Float[np.ndarray, "n 2"],
+) -> Bool[np.ndarray, " n"]:
+    """Which actions `check_contacts` does not refuse; its arguments without the names."""
+    faults = _find_faults(mask, contacts, directions)
+    near = faults.apart <= LARGEST_GAP + METRES_PER_PIXEL / 2
+    return (faults.ahead > 0) & near & ~faults.inside & ~faults.cut
+
+
+class _Faults(NamedTuple):
+    """What `check_contacts` asks of each action."""
+
+    ahead: Float[np.ndarray, " n"]
+    """Distance of the object's middle ahead of the contact point [m]."""
+    apart: Float[np.ndarray, " n"]
+    """Distance of the contact point from the object [m]."""
+    inside: Bool[np.ndarray, " n"]
+    """Whether the object is still there well behind the contact point."""
+    cut: Bool[np.ndarray, " n"]
+    """Whether the object reaches beyond the window of the action's view."""
+
+
+def _find_faults(
+    mask: Bool[np.ndarray, "128 128"],
+    contacts: Float[np.ndarray, "n 2"],
+    directions: Float[np.ndarray, "n 2"],
+) -> _Faults:
+    rim = _rim(mask)
+    rows, columns = mask.sum(axis=1), mask.sum(axis=0)
+    middle = np.array([rows @ np.arange(len(rows)), columns @ np.arange(len(columns))]) / rows.sum()
+    ahead = ((CONTACT_PIXEL - middle) * METRES_PER_PIXEL - contacts) * directions
+    x, y = _along(rim, contacts, directions)
+    apart = np.sqrt((x * x + y * y).min(axis=1))
+    apart[_look_up(mask, contacts)] = 0.0
     left = np.stack([-directions[:, 1], directions[:, 0]], axis=1) * METRES_PER_PIXEL / 2
     behind = contacts - _BEHIND * directions
     inside = _look_up(mask, behind + left) & _look_up(mask, behind - left)
-    if inside.any():
-        raise PredictionError(
-            f"{names[int(inside.argmax())]}the contact point lies in the object, which is still there "
-            f"{100 * LARGEST_GAP:.0f} cm behind it: choose one at its rim"
-        )
     cut = np.zeros(len(contacts), dtype=bool)
-    for middle, reach in zip(CONTACT_PIXEL, (x, y), strict=True):
-        cut |= middle - reach.max(axis=1) / METRES_PER_PIXEL < 0.5
-        cut |= middle - reach.min(axis=1) / METRES_PER_PIXEL > VIEW_SIZE - 1.5
-    if cut.any():
-        raise PredictionError(
-            f"{names[int(cut.argmax())]}the object reaches beyond the view from that contact point: choose another one"
-        )
+    for start, reach in zip(CONTACT_PIXEL, (x, y), strict=True):
+        cut |= start - reach.max(axis=1) / METRES_PER_PIXEL < 0.5
+        cut |= start - reach.min(axis=1) / METRES_PER_PIXEL > VIEW_SIZE - 1.5
+    return _Faults(ahead.sum(axis=1), apart, inside, cut)
 
 
 def _rim(mask: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "k 2"]:

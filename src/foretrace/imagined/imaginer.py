@@ -1,7 +1,7 @@
 """The contract of everything that imagines effects: one door with the same checks, warnings and shapes."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,6 +39,8 @@ from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Effect
 from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import ObjectModel
+from foretrace.registry import Registry
 
 Start = Literal["observed", "estimated"]
 """Where a motion's centre of mass at rest comes from: the first recorded sample, or the view from above."""
@@ -296,6 +298,14 @@ class Imaginer(ABC):
             raise PredictionError(
                 f"the {self.name} predictor makes no use of observed samples: leave them out or use another one"
             )
+
+
+IMAGINERS: Registry[Callable[[ObjectModel | None], Imaginer]] = Registry(
+    "imaginer", "foretrace.imaginers", PredictionError
+)
+"""What makes the imaginers that come ready for use, each by its label; told the object where it is known."""
+IMAGINERS.declare("learned", "foretrace.predictor")
+IMAGINERS.declare("twin", "foretrace.twin")
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Predictors of an action's effect: networks, their training, their checkpoints."""
 
-from foretrace.imagined import Futures, ImaginedBatch, ImaginedEffect, ObservedMotion
+from foretrace.imagined import IMAGINERS, Futures, ImaginedBatch, ImaginedEffect, ObservedMotion
 from foretrace.predictor.base import PREDICTORS, EffectPredictor
 from foretrace.predictor.checkpoint import load_predictor, save_checkpoint
 from foretrace.predictor.config import PredictorConfig, TrainConfig
@@ -29,3 +29,6 @@ __all__ = [
     "save_checkpoint",
     "train_predictor",
 ]
+
+
+IMAGINERS.add("learned", lambda _: load_predictor())

@@ -159,14 +159,6 @@ RANDOMISED = Randomisation(
 """What ``foretrace simulate --randomise`` draws from: around the nominal constants, as wide as a robot's owner might be
 wrong about a slab of wood or plastic, a steel blade and a calibrated camera."""
 
-VARIED_ACTION = {
-    "insertion": (0.012, 0.03),
-    "arc_radius": (0.10, 0.18),
-    "sweep": (0.45, 1.0),
-    "speed": (2 / 3, 1.5),
-}
-"""What ``foretrace simulate --vary-action`` draws from: around the nominal path, within the arm's reach and speed."""
-
 
 LARGEST_COM_OFFSET = 1 / 3
 """What ``foretrace simulate --off-centre`` draws up to, as a share of the inner radius."""

@@ -1,0 +1,166 @@
+"""What goals look at: imagined motions of many actions, in the object's own frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from foretrace.actions import Action
+from foretrace.errors import PlanningError
+from foretrace.geometry import convex_hull
+from foretrace.imagined import Futures, ImaginedBatch
+
+SAME_TIME = 1e-9
+"""Times that differ by less are the same [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Futures of several actions on one object, in the object's frame at rest: z is up, z = 0 the table.
+
+    Each motion counts until its action's path ends.
+    """
+
+    actions: Sequence[Action]
+    """The actions, in the object's frame."""
+    times: Float[np.ndarray, " time"]
+    """Time of each sample [s]."""
+    com: Float[np.ndarray, "batch futures time 3"]
+    """Centres of mass [m]."""
+    turned: Float[np.ndarray, "batch futures time 3"]
+    """Rotation vectors since rest [rad]; NaN where only positions are imagined."""
+    futures: Futures
+    """The futures as imagined, one row for each action, in its action frame."""
+    end: Int[np.ndarray, " batch"]
+    """Last sample that counts."""
+    outline: Float[np.ndarray, "corners 2"]
+    """Outline of the object at rest [m], counter-clockwise."""
+    height: float
+    """Its height [m]."""
+
+    @classmethod
+    def of(
+        cls,
+        imagined: ImaginedBatch,
+        actions: Sequence[Action],
+        outline: Float[np.ndarray, "corners 2"],
+        height: float,
+    ) -> "Motions":
+        """Motions in the frame in which the actions are given.
+
+        Args:
+            imagined: What was imagined, in the frame of each action.
+            actions: The actions.
+            outline: Outline of the object at rest in their frame [m].
+            height: Its height [m].
+        """
+        ends = np.array([action.duration for action in actions])
+        last = np.searchsorted(imagined.times, ends + SAME_TIME, side="right") - 1
+        count = int(last.max()) + 1
+        contacts = np.array([action.contact for action in actions])
+        x = np.array([action.direction for action in actions])
+        axes = np.stack([x, x[:, ::-1] * [-1, 1]], axis=1)[:, None]  # (batch, 1, action axis, coordinate)
+        states = imagined.futures.states[:, :, :count]
+        com, turned = states[..., :3].copy(), states[..., 3:].copy()
+        for vectors in (com, turned):
+            vectors[..., :2] = vectors[..., :2] @ axes
+        com[..., :2] += contacts[:, None, None]
+        return cls(
+            tuple(actions), imagined.times[:count], com, turned, imagined.futures, last, outline, height
+        )
+
+    def __len__(self) -> int:
+        return len(self.com)
+
+    @property
+    def outcome(self) -> np.ndarray:
+        """Outcome of each future: (futures,) array of names."""
+        return np.array(self.futures.outcome)
+
+    @property
+    def probability(self) -> Float[np.ndarray, "batch futures"]:
+        """Probability of each future."""
+        return self.futures.probability
+
+    @property
+    def duration(self) -> Float[np.ndarray, " batch"]:
+        """Time at which each motion ends [s]."""
+        return self.times[self.end]
+
+    @cached_property
+    def counts(self) -> Bool[np.ndarray, "batch time"]:
+        """Samples that count."""
+        return np.arange(len(self.times)) <= self.end[:, None]
+
+    def is_outcome(self, *names: str) -> np.ndarray:
+        """Whether futures have one of these outcomes: (batch, futures) bool."""
+        return np.broadcast_to(np.isin(self.outcome, names), self.probability.shape)
+
+    def at_end(self, values: Float[np.ndarray, "batch futures time *rest"]) -> np.ndarray:
+        """Values at the last sample that counts: (batch, futures, ...)."""
+        return values[np.arange(len(self)), :, self.end]
+
+    def most(self, values: Float[np.ndarray, "batch futures time"]) -> Float[np.ndarray, "batch futures"]:
+        """Greatest of the values that count."""
+        return np.where(self.counts[:, None], values, -np.inf).max(axis=2)
+
+    @cached_property
+    def end_com(self) -> Float[np.ndarray, "batch futures 3"]:
+        """Where the centre of mass ends [m]."""
+        return self.at_end(self.com)
+
+    @cached_property
+    def shift(self) -> Float[np.ndarray, "batch futures 3"]:
+        """How far the centre of mass has come at the end [m]."""
+        return self.end_com - self.com[:, :, 0]
+
+    @cached_property
+    def up(self) -> Float[np.ndarray, "batch futures time 3"]:
+        """Where the object's own z axis points.
+
+        Raises:
+            PlanningError: Only positions were imagined.
+        """
+        if np.isnan(self.turned).all():
+            raise PlanningError(
+                "the imaginer imagines positions alone, the goal asks for a rotation: use one that imagines poses"
+            )
+        angle = np.linalg.norm(self.turned, axis=-1)
+        # Rodrigues' formula for the z axis; sinc is sin(pi x) / (pi x).
+        first = np.sinc(angle / np.pi)
+        second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+        x, y, z = np.moveaxis(self.turned, -1, 0)
+        return np.stack(
+            [first * y + second * x * z, -first * x + second * y * z, 1 - second * (x * x + y * y)], axis=-1
+        )
+
+    @cached_property
+    def tilt(self) -> Float[np.ndarray, "batch futures time"]:
+        """Angle between the object's z axis and the vertical [rad]."""
+        return np.arccos(np.clip(self.up[..., 2], -1.0, 1.0))
+
+    @cached_property
+    def heading(self) -> Float[np.ndarray, "batch futures"]:
+        """Turn about the vertical at the end [rad], between -pi and pi: the twist of the rotation."""
+        angle = np.linalg.norm(self.at_end(self.turned), axis=-1)
+        z = self.at_end(self.turned)[..., 2]
+        share = np.divide(z, angle, out=np.zeros_like(z), where=angle > 0)
+        turn = 2 * np.arctan2(np.sin(angle / 2) * share, np.cos(angle / 2))
+        return (turn + np.pi) % (2 * np.pi) - np.pi
+
+    def footprints(
+        self, rows: Int[np.ndarray, " n"], futures: Int[np.ndarray, " n"], samples: Int[np.ndarray, " time"]
+    ) -> Float[np.ndarray, "n time points 2"]:
+        """Corners of the object's hull from above, upper and lower ones, at samples of some futures [m]."""
+        hull = convex_hull(self.outline)
+        low = np.column_stack([hull, np.zeros(len(hull))])
+        corners = np.concatenate([low, low + np.array([0.0, 0.0, self.height])])
+        turned = np.nan_to_num(self.turned[rows, futures][:, samples])
+        turns = Rotation.from_rotvec(turned.reshape(-1, 3)).as_matrix().reshape(*turned.shape, 3)
+        com = self.com[rows, futures][:, samples]
+        start = self.com[rows, futures, 0]
+        arms = corners - start[:, None]  # (n, points, 3)
+        return np.einsum("ntij,npj->ntpi", turns[:, :, :2], arms) + com[:, :, None, :2]

@@ -1,0 +1,344 @@
+"""The stages of a plan: candidates on the whole outline, refinement of the best, check of the best few."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions.lever_up import VARIED_ACTION
+from foretrace.errors import PlanningError
+from foretrace.imagined import Imaginer
+from foretrace.imagined.context import Context
+from foretrace.planning.candidates import Candidates, Rim, Scene, find_free, place
+from foretrace.planning.goals import Goal, describe
+from foretrace.planning.motions import Motions
+from foretrace.planning.result import Alternative, Plan, RimCost, Stage
+from foretrace.planning.scores import Scores, check_outcomes, score
+
+if TYPE_CHECKING:
+    from foretrace.planning.plan import PlanConfig
+
+MOST_CONTACTS = 120
+"""Contacts around an outline, at most."""
+PATHS = 2
+"""Paths drawn at random at each contact beside the nominal one, where the path may vary."""
+MODES = 6
+"""Places of the outline around which candidates are drawn."""
+APART = 0.006
+"""Contacts nearer than this along the outline are the same place [m]."""
+DIFFERENT = 0.015
+"""An alternative is further than this from the contacts of better ones [m]."""
+ALTERNATIVES = 5
+"""Alternatives, at most."""
+WIDTH = 0.004
+"""Standard deviation of contacts that are drawn in the first round [m]; each further round halves it."""
+TURN_SHARE = 0.5
+"""The same of directions, as a share of the cone, and of a path's parameters, as a share of their ranges / 2."""
+TRUST = 0.75
+"""Weight of the checker's costs and probabilities beside the imaginer's own."""
+TIE = 0.005
+"""Costs that differ by less are the same: half a millimetre. Then the contact decides where errors cost least."""
+ERROR = 0.004
+"""Contacts within this distance are where the blade may arrive instead [m]."""
+TRIED = 64
+"""Candidates that a robot's reach is asked about, at most."""
+
+
+@dataclass
+class Search:
+    """One search, and what it has found so far."""
+
+    scene: Scene
+    goal: Goal
+    imaginer: Imaginer
+    checker: Imaginer | None
+    context: Context
+    config: "PlanConfig"
+    reach: Callable[[LeverUp], str | None] | None = None
+    rim: Rim = field(init=False)
+    lost: Counter[str] = field(default_factory=Counter, init=False)
+    stages: list[Stage] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        self.rim = Rim(self.scene.outline)
+        self.rng = np.random.default_rng(self.config.seed)
+        self.varied = tuple(name for name in VARIED_ACTION if name in self.imaginer.context)
+        if self.config.vary_path and not self.varied:
+            raise PlanningError(
+                f"the {self.imaginer.name} imaginer is conditioned on no parameter of the path: leave vary_path out"
+            )
+
+    def run(self, T_table_object: Float[np.ndarray, "4 4"] | None) -> Plan:
+        """All stages.
+
+        Raises:
+            PlanningError: No contact is free, or the robot reaches none of the best.
+        """
+        pool, scores = self._look_around()
+        rim = self._rim_cost(pool, scores)
+        if self.config.refine:
+            pool, scores = self._refine(pool, scores)
+        rows = self._shortlist(pool, scores)
+        if self.checker is not None and self.checker.name != self.imaginer.name:
+            scores, batch, rows = self._check(pool, scores, rows)
+            imagined = batch[0]
+        else:
+            actions = self.scene.in_view([pool.actions[rows[0]]])
+            imagined = self.imaginer.imagine_candidates(
+                self.scene.view, actions, context=self.context, com=self.scene.com_in_view
+            )[0]
+        best = int(rows[0])
+        one = scores[[best]]
+        return Plan(
+            action=pool.actions[best],
+            imagined=imagined,
+            cost=float(one.cost[0]),
+            risk=float(one.risk[0]),
+            chances=dict(zip(one.names, one.chances[0].tolist(), strict=True)),
+            reached=float(one.reached[0]),
+            goal=describe(self.goal),
+            note=self._note(one, scores),
+            alternatives=self._alternatives(pool, scores, rows),
+            lost=self._reasons(scores, len(pool)),
+            rim=rim,
+            stages=tuple(self.stages),
+            outline=self.scene.outline,
+            height=self.scene.height,
+            object=self.scene.object,
+            T_table_object=T_table_object,
+        )
+
+    def _look_around(self) -> tuple[Candidates, Scores]:
+        """Candidates on the whole outline."""
+        config, started = self.config, perf_counter()
+        number = int(np.clip(round(self.rim.length / config.spacing), 3, MOST_CONTACTS))
+        along = (np.arange(number) + 0.5) * self.rim.length / number
+        turns = np.linspace(-1, 1, config.directions) * config.cone if config.directions > 1 else np.zeros(1)
+        along, turn = (each.ravel() for each in np.meshgrid(along, turns, indexing="ij"))
+        paths = [ToolPath()] * len(along)
+        if config.vary_path:
+            paths += self._draw_paths(np.full((PATHS * len(along), len(self.varied)), 0.5), 1.0)
+            along, turn = np.tile(along, 1 + PATHS), np.tile(turn, 1 + PATHS)
+        pool = self._free(place(self.rim, along, turn, paths))
+        if not len(pool):
+            why = ", ".join(f"at {count} {reason}" for reason, count in self.lost.items())
+            raise PlanningError(
+                f"no contact of the object is free ({why}): lift it by hand, or give a smaller cone or another view"
+            )
+        scores = self._score(self.imaginer, pool)
+        self._tell("imagined", pool, scores, started, None)
+        return pool, scores
+
+    def _refine(self, pool: Candidates, scores: Scores) -> tuple[Candidates, Scores]:
+        """Draw candidates around the best, in rounds; whatever was found stays in the pool."""
+        config, started = self.config, perf_counter()
+        for round in range(config.refine):
+            width = 0.5**round
+            rows = self._distinct(pool, self._order(pool, scores), MODES)
+            parents = rows[self.rng.integers(len(rows), size=config.samples)]
+            along = pool.along[parents] + WIDTH * width * self.rng.normal(size=config.samples)
+            spread = TURN_SHARE * config.cone * width * self.rng.normal(size=config.samples)
+            turn = np.clip(pool.turn[parents] + spread, -config.cone, config.cone)
+            paths = [pool.actions[k].path for k in parents]
+            if config.vary_path:
+                shares = np.array([self._shares(path) for path in paths])
+                paths = self._draw_paths(shares, TURN_SHARE * width)
+            drawn = self._free(place(self.rim, along, turn, paths), count=False)
+            if len(drawn):
+                scores = scores.joined(self._score(self.imaginer, drawn))
+                pool = pool.joined(drawn)
+        self._tell("refined", pool, scores, started, self.stages[-1].cost)
+        return pool, scores
+
+    def _check(
+        self, pool: Candidates, scores: Scores, rows: Int[np.ndarray, " k"]
+    ) -> tuple[Scores, "list", Int[np.ndarray, " k"]]:
+        """Scores with the checked ones blended in, what the checker imagined, and the checked rows, best first."""
+        assert self.checker is not None
+        started, chosen = perf_counter(), pool[rows]
+        batch = self._imagine(self.checker, chosen)
+        motions = Motions.of(batch, chosen.actions, self.scene.outline, self.scene.height)
+        check_outcomes(self.goal, batch.futures.outcome, self.checker.name)
+        own = score(self.goal, motions, self.config.criterion, self.config.tail)
+        blended = scores[rows].blended(own, TRUST)
+        order = self._order(chosen, blended)
+        names = ("cost", "reached", "chances")
+        merged = {name: getattr(scores, name).copy() for name in names}
+        for name in names:
+            merged[name][rows] = getattr(blended, name)
+        self._tell("checked", chosen, blended, started, float(blended.cost[0]), order)
+        return replace(scores, **merged), [batch[int(order[0])]], rows[order]
+
+    def _imagine(self, imaginer: Imaginer, candidates: Candidates):
+        return imaginer.imagine_candidates(
+            self.scene.view,
+            self.scene.in_view(candidates.actions),
+            context=self.context,
+            com=self.scene.com_in_view,
+        )
+
+    def _score(self, imaginer: Imaginer, candidates: Candidates) -> Scores:
+        batch = self._imagine(imaginer, candidates)
+        check_outcomes(self.goal, batch.futures.outcome, imaginer.name)
+        motions = Motions.of(batch, candidates.actions, self.scene.outline, self.scene.height)
+        return score(self.goal, motions, self.config.criterion, self.config.tail)
+
+    def _free(self, candidates: Candidates, count: bool = True) -> Candidates:
+        free, reasons = find_free(self.scene, candidates)
+        if count:
+            self.lost.update(reasons)
+        return candidates[np.flatnonzero(free)]
+
+    def _shares(self, path: ToolPath) -> list[float]:
+        """Where a path's parameters lie within their ranges."""
+        values = path.parameters()
+        return [
+            (values[name] - low) / (high - low)
+            for name, (low, high) in VARIED_ACTION.items()
+            if name in self.varied
+        ]
+
+    def _draw_paths(self, shares: Float[np.ndarray, "n names"], width: float) -> list[ToolPath]:
+        """Paths around those with parameters at some shares of their ranges; a width of 1 covers these."""
+        drawn = np.clip(shares + width * self.rng.uniform(-0.5, 0.5, size=shares.shape), 0.0, 1.0)
+        ranges = [VARIED_ACTION[name] for name in self.varied]
+        values = [low + drawn[:, k] * (high - low) for k, (low, high) in enumerate(ranges)]
+        return [
+            ToolPath.of(**dict(zip(self.varied, row, strict=True)))
+            for row in np.stack(values, axis=1).tolist()
+        ]
+
+    def _order(self, pool: Candidates, scores: Scores) -> Int[np.ndarray, " n"]:
+        """Rows from the best on; of those that are as good as the best, first where an error costs least."""
+        order = scores.order()
+        best = order[0]
+        tied = (scores.cost[order] <= scores.cost[best] + TIE) & (scores.excess[order] <= scores.excess[best])
+        rows = order[tied]
+        if len(rows) > 1:
+            apart = np.abs(pool.along[rows][:, None] - pool.along)
+            near = np.minimum(apart, self.rim.length - apart) <= ERROR
+            loss = scores.cost + scores.excess / np.maximum(scores.limits.min(initial=1.0), 0.01)
+            rows = rows[np.argsort((near * loss).sum(axis=1) / near.sum(axis=1), kind="stable")]
+        return np.concatenate([rows, order[~tied]])
+
+    def _distinct(
+        self, pool: Candidates, order: Int[np.ndarray, " n"], most: int, apart: float = APART
+    ) -> Int[np.ndarray, " k"]:
+        """The first rows of an order whose contacts differ."""
+        contacts, kept = pool.contacts, []
+        for row in order.tolist():
+            if all(np.linalg.norm(contacts[row] - contacts[k]) > apart for k in kept):
+                kept.append(row)
+            if len(kept) == most:
+                break
+        return np.array(kept, dtype=np.int64)
+
+    def _shortlist(self, pool: Candidates, scores: Scores) -> Int[np.ndarray, " k"]:
+        """The best rows that differ and that the robot reaches.
+
+        Raises:
+            PlanningError: It reaches none.
+        """
+        wanted = max(1, self.config.check)
+        order = self._order(pool, scores)
+        if self.reach is None:
+            return self._distinct(pool, order, wanted)
+        kept, first = [], ""
+        for row in self._distinct(pool, order, TRIED).tolist():
+            reason = self.reach(pool.actions[row])
+            if reason is None:
+                kept.append(row)
+            else:
+                self.lost["the robot does not reach it"] += 1
+                first = first or reason
+            if len(kept) == wanted:
+                break
+        if not kept:
+            count = self.lost["the robot does not reach it"]
+            raise PlanningError(
+                f"the robot reaches none of the {count} best contacts (the best: {first}): move object or base"
+            )
+        return np.array(kept, dtype=np.int64)
+
+    def _tell(
+        self,
+        name: str,
+        pool: Candidates,
+        scores: Scores,
+        started: float,
+        before: float | None,
+        order: Int[np.ndarray, " n"] | None = None,
+    ) -> None:
+        best = int((self._order(pool, scores) if order is None else order)[0])
+        contact = pool.contacts[best]
+        moved = float(np.linalg.norm(contact - self.stages[-1].contact)) if self.stages else 0.0
+        cost, risk = float(scores.cost[best]), float(scores.risk[best])
+        self.stages.append(
+            Stage(name, len(pool), contact, cost, risk, before, moved, perf_counter() - started)
+        )
+
+    def _rim_cost(self, pool: Candidates, scores: Scores) -> RimCost:
+        """Of each contact, the best direction's cost and risk."""
+        order = scores.order()
+        _, first = np.unique(pool.along[order], return_index=True)
+        rows = order[first]
+        return RimCost(pool.contacts[rows], scores.cost[rows], scores.risk[rows])
+
+    def _alternatives(
+        self, pool: Candidates, scores: Scores, rows: Int[np.ndarray, " k"]
+    ) -> tuple[Alternative, ...]:
+        """Other contacts, the checked ones first, and why they lost."""
+        others = scores.order()
+        order = np.concatenate([rows, others[~np.isin(others, rows)]])
+        best = int(rows[0])
+        found = []
+        for row in self._distinct(pool, order, ALTERNATIVES + 1, DIFFERENT).tolist()[1:]:
+            one = scores[[row]]
+            found.append(
+                Alternative(
+                    pool.actions[row],
+                    float(one.cost[0]),
+                    float(one.risk[0]),
+                    float(one.reached[0]),
+                    self._why(one, float(scores.cost[best])),
+                )
+            )
+        return tuple(found)
+
+    def _why(self, one: Scores, best: float) -> str:
+        for name, chance, limit in zip(one.names, one.chances[0], one.limits, strict=True):
+            if chance > limit:
+                return f"{name} {chance:.0%}, at most {limit:.0%} accepted"
+        return f"costs {one.cost[0] - best:.2g} more"
+
+    def _reasons(self, scores: Scores, total: int) -> dict[str, int]:
+        """How many candidates were not chosen for which reason."""
+        reasons = dict(self.lost)
+        broken = 0
+        for column, name in enumerate(scores.names):
+            over = int((scores.chances[:, column] > scores.limits[column]).sum())
+            if over:
+                reasons[f"{name} is too probable"] = over
+        broken = int((scores.excess > 0).sum())
+        reasons["costs more"] = max(0, total - 1 - broken)
+        return {reason: count for reason, count in reasons.items() if count}
+
+    def _note(self, one: Scores, scores: Scores) -> str:
+        """What stands in the way; empty where the goal is reached."""
+        if one.excess[0] > 0:
+            over = np.flatnonzero(one.chances[0] > one.limits)[0]
+            return (
+                f"no contact keeps {one.names[over]} to {one.limits[over]:.0%}: here it has a probability of "
+                f"{one.chances[0, over]:.0%}, the least that was imagined is {scores.chances[:, over].min():.0%}"
+            )
+        if one.reached[0] < 0.5:
+            return (
+                f"nothing reaches the goal {describe(self.goal)}: this comes nearest, with a probability of "
+                f"{one.reached[0]:.0%}"
+            )
+        return ""
