@@ -225,9 +225,21 @@ def table() -> dict[str, Call]:
     settings: tuple[Callable[..., Any], ...] = (
         *(ft.ToolPath, ft.SimulationConfig, ft.CollectConfig, ft.TrainConfig, ft.LstmConfig),
         *(ft.OneShotConfig, ft.Bevel, PinholeCamera, Board, photo.PhotoConfig, importing.ImportConfig),
-        *(tracking.TrackConfig, Faults, Randomisation, RecordingConfig),
+        *(tracking.TrackConfig, Faults, Randomisation, RecordingConfig, ft.PlanConfig),
     )
     found = {each.__name__: Call(each, _defaults(each), share=1) for each in settings}
+    goals = {
+        "Lift": _defaults(ft.goals.Lift),
+        "Tilt": {**_defaults(ft.goals.Tilt), "angle": 0.5},
+        "TurnOver": {**_defaults(ft.goals.TurnOver), "edge": 1},
+        "Move": {**_defaults(ft.goals.Move), "direction": (1.0, 0.0)},
+        "MoveTo": {**_defaults(ft.goals.MoveTo), "position": (0.02, 0.01), "turn": 0.1},
+        "SlideOff": {"point": (0.1, 0.0), "outward": (1.0, 0.0)},
+        "Avoid": {**_defaults(ft.goals.Avoid), "zone": [(0.2, 0.0), (0.3, 0.0), (0.2, 0.1)]},
+        "KeepUpright": _defaults(ft.goals.KeepUpright),
+    }
+    for name, usual in goals.items():
+        found[name] = Call(getattr(ft.goals, name), usual, _planned, 1)
     found["Contact"] = Call(importing.Contact, {"point": (0.07, 0.0), "pixel": None, "edge": None}, share=1)
     return found | {
         "Prism": Call(
@@ -292,6 +304,13 @@ def table() -> dict[str, Call]:
         "imagine_batch": Call(
             predictor.imagine_batch, {"batch": thing("batch"), "start": "observed", "observed": 0}, _batch_imagined, 2
         ),
+        "plan": Call(
+            lambda **values: ft.plan(**values, config=ft.PlanConfig(0.02, refine=1, check=0)),
+            {"seen": box, "goal": ft.goals.Lift(), "imaginer": predictor, "context": None, "com": None,
+             "T_table_object": np.eye(4)},
+            lambda plan: (repr(plan), plan.to_dict()),
+            3,
+        ),
         "Dataset.open": Call(ft.Dataset.open, {"path": MATERIALS / "data", "failed": False}, len, 2),
         "Dataset[]": Call(lambda rows: data[rows], {"rows": 1}, share=2),
         "Dataset.where": Call(lambda outcome: data.where(outcome=outcome), {"outcome": "levered"}, len, 2),
@@ -310,6 +329,14 @@ def table() -> dict[str, Call]:
             splits.split_by_object, {"object_ids": np.arange(20), "seed": 0, "fractions": (0.8, 0.1, 0.1)}, share=2
         ),
     }  # fmt: skip
+
+
+def _planned(goal: Any) -> Any:
+    """A plan for a goal that was accepted."""
+    import foretrace as ft
+
+    found = ft.plan(thing("box"), goal, thing("predictor"), config=ft.PlanConfig(0.02, refine=0, check=0))
+    return repr(found), found.cost, found.risk, found.reached
 
 
 def _cloud() -> np.ndarray:

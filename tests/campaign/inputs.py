@@ -102,6 +102,15 @@ def _base(path: Path) -> Any:
     return read_base_pose(path)
 
 
+def _plan(path: Path) -> Any:
+    import foretrace as ft
+    from foretrace.pictures.plan import plan_figure
+
+    found = ft.Plan.open(path)
+    plan_figure(found)
+    return found.imagined.com_trajectory, found.futures.outcomes(), found.T_table_action, repr(found)
+
+
 def _object(path: Path) -> Any:
     import foretrace as ft
     from foretrace.objects.shape_files import read_shape
@@ -166,6 +175,7 @@ READERS: dict[str, Reader] = {
     "film camera": Reader("film/camera.json", "json", lambda path: _frames(path.parent), "film", 1),
     "recording notes": Reader("imported/recordings/00000.json", "json", _notes, "imported", 2),
     "base pose": Reader("base.json", "json", _base, share=3),
+    "plan": Reader("plan/plan.json", "json", _plan, share=4),
     "object": Reader("object.json", "json", _object, share=4),
     "stl": Reader("box.stl", "bytes", _object, share=4),
     "ascii stl": Reader("ascii.stl", "text", _object, share=3),

@@ -78,6 +78,8 @@ def make(folder: str | Path) -> None:
     made = {
         "imported": "import {m}/recording --contact-px {x} {y} --object {m}/object.json --out {m}/imported",
         "evaluated": "evaluate predictor {m}/lstm --data {m}/data --out {m}/evaluated",
+        "plan": "plan {m}/lstm --polygon {m}/outline.txt --goal move --direction 1 0 --pose 0.1 0.2 0.3 --refine 0"
+        " --check 0 --out {m}/plan",
         "film": "film {m}/data 0 --out {m}/film --width 320 --fps 4 --exposures 1 --depth-every 8",
     }
     x, y = (f"{value:.1f}" for value in recorded_scene.contact_pixel(truth))

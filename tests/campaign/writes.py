@@ -110,6 +110,9 @@ JOBS: dict[str, Job] = {
     "calibrate": Job("calibrate {m}/board --out camera.json"),
     "calibrate --print-board": Job("calibrate --print-board board.png"),
     "predict": Job("predict {m}/lstm --polygon {m}/outline.txt --edge 0 --out out --no-animation"),
+    "plan": Job(
+        "plan {m}/lstm --polygon {m}/outline.txt --goal move --direction 1 0 --refine 0 --check 0 --out out"
+    ),
     "show": Job("show {m}/data --out sheet.png"),
     "robot": Job("robot --base {m}/base.json --contact 0 0 --direction 1 0 --speed 1 --no-retreat --out out"),
     "demo": Job(

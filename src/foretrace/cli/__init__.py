@@ -44,6 +44,7 @@ COMMANDS: dict[str, Entry] = {
     "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
     "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
     "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
+    "plan": _command("planning:plan", "Choose where and how an object is levered for a goal.", LEARN),
     "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
     "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or print its board or markers.", SEE),
     "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),

@@ -125,11 +125,12 @@ class PhotoOptions:
                 options.append(f"--{'no-' if value is False else ''}{each.name}")
         return options
 
-    def observe(self, height: float | None) -> "PhotoView":
+    def observe(self, height: float | None, needs_contact: bool = True) -> "PhotoView":
         """What the photograph shows.
 
         Args:
             height: Height of the object, if it is known [m].
+            needs_contact: Whether a contact has to be given; else the largest object is meant without one.
 
         Raises:
             PredictionError: No contact is given.
@@ -137,7 +138,7 @@ class PhotoOptions:
         """
         from foretrace.perception.photo import open_photo
 
-        if self.photo is None or self.contact_px is None:
+        if self.photo is None or (self.contact_px is None and needs_contact):
             raise PredictionError("--photo needs --contact-px COLUMN ROW, a pixel on the object's upper rim")
         files = {name: getattr(self, name) for name in ("camera", "markers", "depth", "background")}
         return open_photo(self.photo, self.contact_px, **files, config=replace(self.found, height=height))
@@ -181,7 +182,8 @@ def predict(
         at: The contact: either --edge or --contact.
         photo: A photograph of the object on a table, in place of object and contact.
         context: Context of a predictor that is conditioned on it, and settings of --compare.
-        run: Folder of the training; by default the predictor that comes with foretrace.
+        run: Folder of the training, by default the predictor that comes with foretrace; or a plan.json of
+            `foretrace plan`, which is shown alone.
         unknown: Tell the predictor only the constants that are given here; by default the others are the nominal ones.
         compare: Simulate the same lever-up and show truth and error beside the prediction.
         animation: Write an animation as well.
@@ -193,6 +195,9 @@ def predict(
     from foretrace.pictures.scene import Scene, scene_figure
     from foretrace.predictor import load_predictor
 
+    if run is not None and run.is_file() and run.suffix == ".json":
+        _show_plan(run, out, [*photo.given(), *_changed(obj), *_changed(at), *_changed(context)])
+        return
     predictor = load_predictor(run)
     seen = None
     if photo.photo is not None:
@@ -227,6 +232,28 @@ def predict(
     if truth is not None:
         _print_comparison(imagined.com_trajectory, truth)
     print("\n".join(str(file) for file in sorted(out.iterdir())))
+
+
+def _show_plan(file: Path, out: Path, idle: list[str]) -> None:
+    """Show a plan that was saved.
+
+    Raises:
+        PredictionError: Something else is given beside it.
+    """
+    from foretrace.cli.planning import show_plan
+
+    if idle:
+        raise PredictionError(f"{file} is a plan, which has object and contact: leave out {', '.join(idle)}")
+    show_plan(file, out)
+
+
+def _changed(options: Any) -> list[str]:
+    """Names of options that were given."""
+    return [
+        f"--{each.name.replace('_', '-')}"
+        for each in fields(options)
+        if getattr(options, each.name) != each.default
+    ]
 
 
 def _object_and_action(

@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli.console import say
 from foretrace.errors import RobotError
 from foretrace.files import write_json
 from foretrace.geometry import matrix_to_pose
+from foretrace.planning import Plan
 from foretrace.robot.checks import ArmLimits, Check, check_path, refuse_unsafe
 from foretrace.robot.dashboard import check_host
 from foretrace.robot.deviation import OTHER_ARM
@@ -29,10 +30,11 @@ from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
 
 def robot(
     base: Path,
-    contact: tuple[float, float],
-    direction: tuple[float, float],
     path: Annotated[OmitArgPrefixes[ToolPath], arg(name="path")],
     watch: Annotated[OmitArgPrefixes[WatchConfig], arg(name="watch")],
+    plan: Positional[Path | None] = None,
+    contact: tuple[float, float] | None = None,
+    direction: tuple[float, float] | None = None,
     out: Path = Path("execution"),
     speed: float = 0.1,
     retreat: bool = True,
@@ -52,6 +54,7 @@ def robot(
 
     Args:
         base: JSON file with the calibrated pose of the arm's base in the table frame.
+        plan: plan.json of `foretrace plan`, in place of contact, direction and path.
         contact: Where the blade meets the object, X Y in the table frame [m].
         direction: Along which the blade is pushed, X Y in the table frame; its length does not matter.
         out: Folder for path.csv, checks.json, recording.csv and film.
@@ -82,7 +85,8 @@ def robot(
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
     T_table_base[:3, 3] += correction
-    legs = plan_lever_up(kinematics, LeverUp(contact, direction, path), T_table_base, speed)
+    action = _action(plan, contact, direction, path)
+    legs = plan_lever_up(kinematics, action, T_table_base, speed)
     legs += plan_retreat(legs) if retreat else []
     postures = [kinematics.along(leg.joints) for leg in legs]
     checks = [
@@ -118,6 +122,27 @@ def robot(
         say(f"interrupted; {stop}")
         raise
     print(recording)
+
+
+def _action(
+    plan: Path | None,
+    contact: tuple[float, float] | None,
+    direction: tuple[float, float] | None,
+    path: ToolPath,
+) -> LeverUp:
+    """The lever-up in the table frame.
+
+    Raises:
+        RobotError: It is given twice, or not at all.
+        PlanningError: The plan cannot be read, or does not know where the object lies.
+    """
+    if plan is not None:
+        if contact is not None or direction is not None or path != ToolPath():
+            raise RobotError(f"{plan} says where and how: leave out --contact, --direction and the path")
+        return Plan.open(plan).table_action
+    if contact is None or direction is None:
+        raise RobotError("give a plan.json of `foretrace plan`, or --contact X Y and --direction X Y")
+    return LeverUp(contact, direction, path)
 
 
 def _agreed(host: str, num_set_points: int) -> bool:

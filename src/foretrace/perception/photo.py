@@ -121,7 +121,7 @@ class PhotoView(Observation):
 def observe_photo(
     image: UInt8[np.ndarray, "rows columns 3"],
     camera: PinholeCamera,
-    contact: tuple[float, float],
+    contact: tuple[float, float] | None,
     *,
     layout: MarkerLayout | None = None,
     T_table_camera: Float[np.ndarray, "4 4"] | None = None,
@@ -134,7 +134,8 @@ def observe_photo(
     Args:
         image: The photograph: blue, green, red.
         camera: The camera that took it.
-        contact: Column and row of the contact, on the object's upper rim.
+        contact: Column and row of the contact, on the object's upper rim. None: the largest object, at the middle of
+            its longest edge.
         layout: Markers, of which those on the table place the camera.
         T_table_camera: Pose of the camera, if it is known; takes the place of a layout.
         depth: Distance along the optical axis, pixel by pixel of the photograph [m]; 0: not measured.
@@ -152,13 +153,23 @@ def observe_photo(
     if T_table_camera is None:
         T_table_camera = locate_camera(image, camera, layout, depth)
     heights = None if depth is None else masks.heights_above_table(depth, camera, T_table_camera)
-    _check_sight(camera, T_table_camera, contact)
+    if contact is not None:
+        _check_sight(camera, T_table_camera, contact)
     mask, rim = _find(image, contact, background, heights, config)
+    if contact is None:
+        rows, columns = np.nonzero(mask > 0.5)
+        _check_sight(camera, T_table_camera, (float(columns.mean()), float(rows.mean())))
     height = config.height
     if height is None:
         height = DEFAULT_HEIGHT if heights is None else masks.object_height(heights, mask > 0.5)
     placed = place_object(mask, camera, T_table_camera, height, min(rim, 0.5 * height), config.hull)
-    found = observe(placed, contact_at_pixel(placed, contact, camera, T_table_camera))
+    if contact is None:
+        corners = placed.object.corners
+        edges = np.roll(corners, -1, axis=0) - corners
+        longest = int(np.linalg.norm(edges, axis=1).argmax())
+        found = observe(placed, corners[longest] + edges[longest] / 2)
+    else:
+        found = observe(placed, contact_at_pixel(placed, contact, camera, T_table_camera))
     view = found.view
     if depth is not None and not config.flat:
         T_action_camera = invert_transform(found.T_table_action) @ T_table_camera
@@ -207,7 +218,7 @@ def locate_camera(
 
 def _find(
     image: UInt8[np.ndarray, "rows columns 3"],
-    contact: tuple[float, float],
+    contact: tuple[float, float] | None,
     background: UInt8[np.ndarray, "other_rows other_columns 3"] | None,
     heights: Float[np.ndarray, "rows columns"] | None,
     config: PhotoConfig,
@@ -237,6 +248,10 @@ def _find(
             raise PerceptionError("--mask grabcut needs --box LEFT TOP WIDTH HEIGHT round the object")
         found = masks.mask_by_grabcut(image, config.box)
     elif method == "colour":
+        if contact is None:
+            raise PerceptionError(
+                "--mask colour needs --contact-px COLUMN ROW, a pixel on the object's upper rim"
+            )
         found = masks.mask_by_colour(image, contact)
     else:
         found = masks.mask_by_threshold(image)
@@ -245,7 +260,7 @@ def _find(
 
 def open_photo(
     photo: Path,
-    contact: tuple[float, float],
+    contact: tuple[float, float] | None,
     *,
     camera: Path | None = None,
     markers: Path | None = None,
@@ -257,7 +272,7 @@ def open_photo(
 
     Args:
         photo: The photograph.
-        contact: Column and row of the contact, on the object's upper rim.
+        contact: Column and row of the contact, on the object's upper rim; None: as of `observe_photo`.
         camera: The camera's JSON file; by default ``camera.json`` beside the photograph.
         markers: Marker layout; by default ``markers.json`` beside the photograph. Not needed with a depth image.
         depth: Depth image: PNG of 16 bits in millimetres, or ``.npy`` in metres.

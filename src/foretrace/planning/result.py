@@ -67,14 +67,15 @@ class Stage:
     """Cost of the former stage's choice, as this stage has it; None: there is no former one."""
     moved: float
     """Distance of its contact from the former stage's [m]."""
-    seconds: float
-    """Time that it took [s]."""
+    seconds: float | None = None
+    """Time that it took [s]; not kept in files."""
 
     def __str__(self) -> str:
         former = (
             "" if self.before is None else f" (before: {self.before:.3f}, {100 * self.moved:.1f} cm away)"
         )
-        return f"{self.name}: {self.count} candidates, cost {self.cost:.3f}{former}, {1000 * self.seconds:.0f} ms"
+        took = "" if self.seconds is None else f", {1000 * self.seconds:.0f} ms"
+        return f"{self.name}: {self.count} candidates, cost {self.cost:.3f}{former}{took}"
 
 
 class _Action(TypedDict):
@@ -105,7 +106,6 @@ class _Stage(TypedDict):
     risk: Finite
     before: Finite | None
     moved: Finite
-    seconds: Finite
 
 
 class _Rim(TypedDict):
@@ -235,7 +235,10 @@ class Plan:
                 }
                 for each in self.alternatives
             ],
-            "stages": [{**vars(each), "contact": each.contact.tolist()} for each in self.stages],
+            "stages": [
+                {name: np.array(value).tolist() for name, value in vars(each).items() if name != "seconds"}
+                for each in self.stages
+            ],
             "rim": {name: values.tolist() for name, values in vars(self.rim).items()},
             "outline": self.outline.tolist(),
             "height": self.height,

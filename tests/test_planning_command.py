@@ -1,0 +1,170 @@
+"""`foretrace plan`: from files, data sets and photographs to a plan, and from there to the robot."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import foretrace as ft
+from engines_at_hand import WITHOUT_BULLET
+from foretrace.cli import main
+from foretrace.geometry import invert_transform
+from foretrace.interactions.recording_folder import read_image
+from foretrace.simulation.recording import RecordingTruth
+from recorded_scene import PRISM
+
+OUTLINE = "0.09 0\n0.02 0.08\n-0.07 0.05\n-0.08 -0.04\n0.03 -0.08\n"
+QUICK = ["--refine", "0", "--check", "0"]
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "outline.txt").write_text(OUTLINE)
+    base = {"format": "foretrace-base-pose", "version": 1, "T_table_base": [-0.75, 0, 0, 1, 0, 0, 0]}
+    (tmp_path / "base.json").write_text(json.dumps(base))
+    (tmp_path / "far.json").write_text(json.dumps({**base, "T_table_base": [-3, 0, 0, 1, 0, 0, 0]}))
+    return tmp_path
+
+
+def run(words: str) -> int:
+    return main(words.split())
+
+
+def test_polygon_to_plan_to_robot(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = "plan --polygon outline.txt --goal lift --max-slip 0.05 --pose 0.02 0.01 0.4 --base base.json"
+    assert main([*command.split(), *QUICK]) == 0
+    told = capsys.readouterr().out
+    assert "goal: Lift(" in told
+    assert "on the table: x" in told
+    found = ft.Plan.open("plan/plan.json")
+    assert read_image(Path("plan/plan.png")).shape[0] > 300
+    assert run("robot plan/plan.json --base base.json --out slow") == 0
+    checks = json.loads(Path("slow/checks.json").read_text())
+    assert all(check["passed"] for check in checks)
+    path = np.genfromtxt("slow/path.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    lever = path[path["leg"] == "lever-up"]
+    start = found.table_action.contact - found.action.path.standoff * found.table_action.direction
+    np.testing.assert_allclose([lever["tip_x_m"][0], lever["tip_y_m"][0]], start, atol=1e-4)
+    capsys.readouterr()
+    assert run("predict plan/plan.json --out shown") == 0
+    assert Path("shown/plan.png").exists()
+    assert "goal: Lift(" in capsys.readouterr().out
+
+
+def test_object_of_a_data_set(files: Path) -> None:
+    tool = ft.SimulationConfig(embodiment="tool")
+    ft.collect(ft.CollectConfig(1, 1, simulation=tool), "data", workers=1)
+    assert main(["plan", "--data", "data", "--id", "0", "--goal", "tumble", *QUICK]) == 0
+    found = ft.Plan.open("plan/plan.json")
+    assert found.object is not None
+    np.testing.assert_allclose(found.object.corners, ft.Dataset.open("data").with_id(0).object.corners)
+
+
+def test_what_is_told_and_what_is_avoided_change_the_plan(files: Path) -> None:
+    Path("zone.txt").write_text("-0.3 -0.3\n-0.1 -0.3\n-0.1 0.3\n-0.3 0.3\n")
+    whole = ["plan", "--polygon", "outline.txt", "--goal", "move", "--direction", "1", "0", *QUICK]
+    assert main([*whole, "--out", "free"]) == 0
+    assert main([*whole, "--avoid", "zone.txt", "--keep-upright", "--out", "kept"]) == 0
+    free, kept = (ft.Plan.open(f"{name}/plan.json") for name in ("free", "kept"))
+    assert free.action.contact[0] < -0.05 < kept.action.contact[0]
+    assert kept.chances["entering the zone"] <= 0.05
+    assert main([*whole, "--friction", "0.5", "--unknown", "--out", "told"]) == 0
+    told = ft.Plan.open("told/plan.json").imagined.context
+    assert told["friction"] == 0.5
+    assert np.isnan(told["density"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("", "no object given"),
+        ("--polygon outline.txt --goal tilt", "--goal tilt needs --angle"),
+        ("--polygon outline.txt --angle 0.5", "--angle goes with --goal tilt"),
+        ("--polygon outline.txt --goal turn-over", "either --edge or --direction"),
+        ("--polygon outline.txt --goal turn-over --edge 9", "with 5 edges"),
+        ("--polygon outline.txt --goal lift --max-slip 3", "max_slip is 3.0"),
+        ("--polygon outline.txt --base base.json", "--pose X Y TURN"),
+        ("--polygon outline.txt --base far.json --pose 0 0 0", "the robot reaches none"),
+        ("--polygon outline.txt --base base.json --pose 0 0 0 --speed 7", "speed 7.0"),
+        ("--polygon outline.txt --data data", "--data and --id go together"),
+        ("--polygon outline.txt --data data --id 0", "leave out the other ways"),
+        ("--polygon outline.txt --contact-px 3 4", "--contact-px goes with --photo"),
+        ("--polygon outline.txt --density -1", "--density is -1.0"),
+        ("--polygon outline.txt --cone 7", "cone = 7.0"),
+        ("--photo p.jpg --pose 0 0 0", "leave --pose out"),
+        ("--photo p.jpg --polygon outline.txt", "leave out the other ways"),
+        ("--photo p.jpg", "does not exist"),
+        ("--polygon outline.txt --avoid outline.txt", "lies in the zone"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(
+    files: Path, capsys: pytest.CaptureFixture[str], options: str, message: str
+) -> None:
+    assert main(["plan", *options.split(), *QUICK]) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 1
+    assert message in told[0]
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("robot --base base.json", "give a plan.json"),
+        ("robot plan/plan.json --base base.json", "where the object lies"),
+        ("robot plan/plan.json --base base.json --contact 0 0", "leave out --contact"),
+        ("robot outline.txt --base base.json", "cannot be read as JSON"),
+        ("predict plan/plan.json --edge 0", "leave out --edge"),
+    ],
+)
+def test_mistakes_with_a_plan(
+    files: Path, capsys: pytest.CaptureFixture[str], command: str, message: str
+) -> None:
+    assert main(["plan", "--polygon", "outline.txt", *QUICK]) == 0
+    capsys.readouterr()
+    assert run(command) == 2
+    assert message in capsys.readouterr().err
+
+
+def chain(folder: Path, *options: str) -> ft.Plan:
+    """The plan from the first photograph of a recording."""
+    command = ["plan", "--photo", str(folder / "colour-00000.jpg"), "--height", str(PRISM.height)]
+    assert main([*command, "--goal", "lift", *options]) == 0
+    return ft.Plan.open("plan/plan.json")
+
+
+def true_action(found: ft.Plan, truth: RecordingTruth) -> ft.LeverUp:
+    """The plan's lever-up in the frame of the object that was photographed."""
+    T = invert_transform(truth.T_table_object[0])
+    placed = found.table_action
+    return ft.LeverUp(T[:2, :2] @ placed.contact + T[:2, 3], T[:2, :2] @ placed.direction)
+
+
+@pytest.mark.slow
+@WITHOUT_BULLET
+def test_photograph_to_plan_to_the_real_object(recorded: tuple[Path, RecordingTruth], files: Path) -> None:
+    """What is planned from a photograph happens to the object that was photographed: with the whole arm, and in an
+    engine with other physics."""
+    folder, truth = recorded
+    found = chain(folder, "--background", str(folder / "background.png"), "--base", "base.json")
+    assert Path("plan/overlay.png").exists()
+    action = true_action(found, truth)
+    action.check_contact(PRISM)
+    assert run("robot plan/plan.json --base base.json --out path") == 0
+    other = ft.Physics(friction=0.6, tool_friction=0.4)
+    for settings in ({"embodiment": "arm"}, {"engine": "bullet", "embodiment": "tool", "physics": other}):
+        effect = ft.simulate_lever_up(PRISM, action, ft.SimulationConfig(**settings)).effect
+        assert effect.outcome == "levered"
+        rise = effect.com_trajectory[-1, 2] - effect.com_trajectory[0, 2]
+        assert rise == pytest.approx(-0.1 * found.cost, abs=0.01)
+
+
+@pytest.mark.slow
+def test_photograph_without_a_contact_shows_the_largest_object(
+    recorded: tuple[Path, RecordingTruth], files: Path
+) -> None:
+    folder, truth = recorded
+    found = chain(folder, "--depth", str(folder / "depth-00000.png"), "--no-flat", *QUICK)
+    true_action(found, truth).check_contact(PRISM)
+    assert found.object is None
