@@ -11,9 +11,11 @@ if TYPE_CHECKING:
     from foretrace.actions import Action, LeverUp, ToolPath
     from foretrace.errors import ForetraceError
     from foretrace.features import FeatureExtractor
+    from foretrace.imagined import Belief
     from foretrace.interactions.dataset import Dataset, InteractionBatch
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
+    from foretrace.monitoring import Monitor, MonitorCalibration, Verdict, identify
     from foretrace.objects import (
         Bevel,
         Box,
@@ -44,9 +46,11 @@ __version__ = "0.1.0"
 _HOMES = {
     "foretrace.actions": ("Action", "LeverUp", "ToolPath"),
     "foretrace.errors": ("ForetraceError",),
+    "foretrace.imagined": ("Belief",),
     "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
+    "foretrace.monitoring": ("Monitor", "MonitorCalibration", "Verdict", "identify"),
     "foretrace.objects": (
         *("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "Weighted"),
         *("paper_objects", "sample_prism"),
@@ -72,6 +76,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Action",
+    "Belief",
     "Bevel",
     "Box",
     "CollectConfig",
@@ -86,6 +91,8 @@ __all__ = [
     "LeverUp",
     "LstmConfig",
     "MeshObject",
+    "Monitor",
+    "MonitorCalibration",
     "ObservedMotion",
     "OneShotConfig",
     "Outcome",
@@ -100,9 +107,11 @@ __all__ = [
     "TrainConfig",
     "TwinConfig",
     "TwinImaginer",
+    "Verdict",
     "Weighted",
     "collect",
     "goals",
+    "identify",
     "load_predictor",
     "paper_objects",
     "plan",

@@ -78,6 +78,10 @@ class PlanningError(ForetraceError):
     """A goal that cannot be planned for: no contact is free, nothing is asked for, a value is out of its range."""
 
 
+class MonitoringError(ForetraceError):
+    """An execution that cannot be watched: poses in another frame, no rest to compare with, an unknown calibration."""
+
+
 class ResultsError(ForetraceError):
     """Results that are missing, damaged or of another version, data set or recipe; an experiment that is unknown."""
 

@@ -3,6 +3,7 @@
 Nothing here imports a learning library: a predictor that was trained is one kind of imaginer among others.
 """
 
+from foretrace.imagined.belief import Belief
 from foretrace.imagined.domain import estimate_com
 from foretrace.imagined.futures import (
     FLOOR,
@@ -23,6 +24,7 @@ __all__ = [
     "LEVELS",
     "MIN_PROBABILITY",
     "STARTS",
+    "Belief",
     "Futures",
     "ImaginedBatch",
     "ImaginedEffect",

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +12,9 @@ from foretrace.errors import PredictionError
 from foretrace.geometry import rotation_vector_to_quaternion
 from foretrace.imagined.context import CONSTANTS, nominal_constants
 from foretrace.interactions.record import Outcome
+
+if TYPE_CHECKING:
+    from foretrace.imagined.worlds import Worlds
 
 LEVELS = np.arange(1, 100) / 100
 """Levels of the prediction regions whose widths a predictor keeps."""
@@ -223,6 +227,8 @@ class ImaginedEffect:
     """Respects in which object or action are unlike those that the predictor has learned from."""
     context: Mapping[str, float] = field(default_factory=dict)
     """What the imaginer was told beside the view, by name [SI]; NaN: not told."""
+    worlds: "Worlds | None" = None
+    """Motions in all worlds of a `Belief` that was averaged over; None: there was none."""
 
     def __repr__(self) -> str:
         chances = ", ".join(

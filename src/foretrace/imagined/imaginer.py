@@ -10,11 +10,14 @@ from typing import ClassVar, Literal, final
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import Action
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import PredictionError, check_type, shown
-from foretrace.geometry import Numbers, finite_array
+from foretrace.geometry import Numbers, finite_array, rotation_vector_to_quaternion
+from foretrace.imagined.belief import Belief
 from foretrace.imagined.context import (
+    CONSTANTS,
     PARAMETERS,
+    UNKNOWN,
     Context,
     column_of,
     find_unconditioned,
@@ -33,8 +36,9 @@ from foretrace.imagined.domain import (
     measure,
     measure_candidates,
 )
-from foretrace.imagined.futures import ImaginedBatch, ImaginedEffect
+from foretrace.imagined.futures import Futures, ImaginedBatch, ImaginedEffect
 from foretrace.imagined.observed import SAME_TIME, ObservedMotion, observed_motion, rotations_since_rest
+from foretrace.imagined.worlds import average_worlds, gather_worlds, play_worlds, wrong_worlds
 from foretrace.interactions.batch import Candidates
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Effect
@@ -47,6 +51,8 @@ Start = Literal["observed", "estimated"]
 STARTS: tuple[Start, ...] = ("observed", "estimated")
 
 
+CANDIDATE_WORLDS = 32
+"""Worlds that each of several candidates is imagined in, where a belief is averaged over."""
 UNSURE = 0.01
 """A prediction whose expected error is larger is pointed out [m]."""
 UNSURE_OF = "an error of {:.2g} cm is expected: several motions are likely, or the object is unlike those learned from"
@@ -122,7 +128,7 @@ class Imaginer(ABC):
         view: TopDownView,
         action: Action | None = None,
         *,
-        context: Context = None,
+        context: Context | Belief = None,
         observed: Effect | ObservedMotion | None = None,
         com: Numbers | None = None,
     ) -> ImaginedEffect:
@@ -133,7 +139,8 @@ class Imaginer(ABC):
             action: The action. Its path's parameters are context; a path that is not nominal is pointed out if the
                 imaginer is not conditioned on it. The view's frame says where it acts. None: the nominal path.
             context: Values of the variables that the imaginer is conditioned on, by name [SI]; a constant that is left
-                out is not told. None tells the nominal constants, ``unknown`` none.
+                out is not told. None tells the nominal constants, ``unknown`` none. A `Belief` is averaged over, and
+                the effect keeps all its worlds.
             observed: Beginning of the motion, where it is under way: the record's own `Effect`, or poses with times.
             com: The centre of mass at rest in the action frame [m]. By default that of the observed motion, or the one
                 estimated from the view: above the centre of the mask's area, at half the object's greatest height.
@@ -150,13 +157,16 @@ class Imaginer(ABC):
         if action is not None:
             check_type("action", action, Action, PredictionError)
             parameters = parameters_of([action])
-        values = given_context(self.context, context, parameters, 1, self.marginal)
+        belief = context if isinstance(context, Belief) else None
+        values = given_context(self.context, self._without(belief, context), parameters, 1, self.marginal)
         batch = InteractionBatch.from_views([view])
         motion = None if observed is None else observed_motion(observed)
         if com is None and motion is not None and motion.com is not None:
             com = motion.com[0]
         place = estimate_com(batch)[0] if com is None else _point(com)
         check_com(view, place)
+        if belief is not None:
+            return self._imagine_worlds(view, action, belief, place, observed is not None)
         seen = None
         if motion is not None:
             self._check_observes()
@@ -218,7 +228,7 @@ class Imaginer(ABC):
         view: TopDownView,
         actions: Iterable[Action],
         *,
-        context: Context = None,
+        context: Context | Belief = None,
         com: Numbers | None = None,
     ) -> ImaginedBatch:
         """Imagine the effects of several actions on one object from a single view.
@@ -226,7 +236,7 @@ class Imaginer(ABC):
         Args:
             view: The object from above, in any action frame; contact and direction of that frame do not matter.
             actions: The actions, in the view's frame: contact points [m] and directions there, and their paths.
-            context: As of `imagine`, the same for all.
+            context: As of `imagine`, the same for all. Of a `Belief`, `CANDIDATE_WORLDS` worlds are imagined.
             com: The centre of mass at rest in the view's frame [m]; by default estimated from the view.
 
         Returns:
@@ -250,23 +260,88 @@ class Imaginer(ABC):
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
-        values = given_context(self.context, context, parameters, len(actions), self.marginal)
+        belief = context if isinstance(context, Belief) else None
+        values = given_context(
+            self.context, self._without(belief, context), parameters, len(actions), self.marginal
+        )
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
         check_com(view, middle)
+        if belief is not None:
+            return self._average(view, actions, belief, candidates.enter(middle))
         start = "estimated" if com is None else "observed"
         return self._answer(Scenes(candidates, candidates.enter(middle), values, start), parameters)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
-        """The imagined effects, with warnings about paths that the imaginer is not conditioned on."""
-        imagined = self.imagine_scenes(scenes)
-        about_objects = imagined.warnings or ((),) * len(scenes)
-        about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(scenes)
+        return self._warned(self.imagine_scenes(scenes), scenes.context, parameters)
+
+    def _warned(
+        self, imagined: ImaginedBatch, context: np.ndarray, parameters: dict[str, np.ndarray]
+    ) -> ImaginedBatch:
+        """Effects with warnings, also about paths that the imaginer is not conditioned on, and what it was told."""
+        about_objects = imagined.warnings or ((),) * len(context)
+        about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(context)
         errors = imagined.futures.expected_error()
         unsure = [(UNSURE_OF.format(100 * error),) if error > UNSURE else () for error in errors]
         warnings = tuple(a + b + c for a, b, c in zip(about_objects, about_paths, unsure, strict=True))
-        return replace(
-            imagined, warnings=warnings, context=dict(zip(self.context, scenes.context.T, strict=True))
-        )
+        return replace(imagined, warnings=warnings, context=dict(zip(self.context, context.T, strict=True)))
+
+    def _without(self, belief: Belief | None, context: Context | Belief) -> Context:
+        """The context as it is told; of a belief, the path's parameters alone."""
+        if belief is None and not isinstance(context, Belief):
+            return context
+        return UNKNOWN if self.marginal else None
+
+    def _imagine_worlds(
+        self, view: TopDownView, action: Action | None, belief: Belief, com: np.ndarray, observed: bool
+    ) -> ImaginedEffect:
+        """The effect averaged over a belief, with all its worlds and those in which something is wrong."""
+        if observed:
+            raise PredictionError(
+                "a belief is given as context, and observed samples: give the samples to foretrace.identify, or to a "
+                "Monitor of the effect"
+            )
+        if action is None:
+            action = LeverUp((0.0, 0.0), (1.0, 0.0))
+        parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}
+        values, causes = wrong_worlds(belief.sample(belief.worlds))
+        played = play_worlds(self, view, action, com, values, parameters)
+        count = belief.worlds
+        futures = average_worlds(played.futures[np.arange(count)], count, com[None])
+        worlds = gather_worlds(played, values, causes)
+        own = {name: np.array([value]) for name, value in parameters.items()}
+        answer = self._finish(futures, played.warnings[:1], own)
+        return replace(answer[0], worlds=worlds)
+
+    def _average(
+        self, view: TopDownView, actions: tuple[Action, ...], belief: Belief, com: np.ndarray
+    ) -> ImaginedBatch:
+        """The effects of several actions, averaged over a belief."""
+        count = min(belief.worlds, CANDIDATE_WORLDS)
+        values = belief.sample(count)
+        parts, warnings = [], []
+        for action, place in zip(actions, com, strict=True):
+            parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}
+            played = play_worlds(self, view.seen_from(action), action, place, values, parameters)
+            parts.append(average_worlds(played.futures, count, place[None]))
+            warnings.append(played.warnings[0] if played.warnings else ())
+        names = ("probability", "states", "spread", "support_points")
+        together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
+        wide = [np.broadcast_to(each.quantiles, (1, each.quantiles.shape[-1])) for each in parts]
+        futures = replace(parts[0], **together, quantiles=np.concatenate(wide))
+        return self._finish(futures, tuple(warnings), parameters_of(actions))
+
+    def _finish(
+        self, futures: Futures, warnings: tuple[tuple[str, ...], ...], parameters: dict[str, np.ndarray]
+    ) -> ImaginedBatch:
+        """Effects whose averaged futures these are, with warnings and what is told of their contexts."""
+        best = futures.states[np.arange(len(futures)), futures.probability.argmax(axis=1)]
+        pose = np.concatenate([best[..., :3], rotation_vector_to_quaternion(best[..., 3:])], axis=-1)
+        told = np.full((len(futures), len(self.context)), np.nan)
+        for column, name in enumerate(self.context):
+            if name not in CONSTANTS and name in parameters:
+                told[:, column] = parameters[name]
+        imagined = ImaginedBatch(self.sample_times, best[..., :3], pose, futures, warnings)
+        return self._warned(imagined, told, parameters)
 
     def _observe_batch(self, batch: InteractionBatch, count: int) -> Float[np.ndarray, "batch samples 6"]:
         """The first recorded samples of each motion at the imaginer's sample times."""

@@ -1,0 +1,118 @@
+"""Numbers of the monitor's experiment from its rows: scores by method, detections, delays, causes, rests."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from foretrace.evaluation.tables import markdown_table
+from foretrace.experiments.executions import CAUSES, FAULTS, MOVED
+
+CM = 100.0
+NORMAL, CALIBRATION = "normal", "calibration"
+PROBES = tuple(range(4, 59, 6))
+"""Samples at which distances are kept, for quantiles that hold for each of them."""
+Table = Mapping[str, np.ndarray]
+"""Columns of rows by name."""
+
+
+def columns(rows: pd.DataFrame) -> Table:
+    """Columns of rows by name."""
+    return {str(name): np.asarray(rows[name]) for name in rows.columns}
+
+
+def pick(table: Table, mask: np.ndarray) -> Table:
+    """Some rows."""
+    return {name: values[mask] for name, values in table.items()}
+
+
+def is_wrong(table: Table) -> np.ndarray:
+    """Which rows have a fault that moves something."""
+    return np.isin(table["part"], FAULTS) & (table["moved"] > CM * MOVED)
+
+
+def scores_of(table: Table) -> dict[str, tuple[np.ndarray, float]]:
+    """Score of each execution and threshold, by method; baselines are calibrated on executions of their own."""
+    own = table["part"] == CALIBRATION
+    own = own if own.any() else table["part"] == NORMAL
+
+    def calibrated(values: np.ndarray, level: float = 0.95) -> float:
+        ordered = np.append(np.sort(values[own]), np.inf)
+        return float(ordered[min(int(np.ceil(level * len(ordered))) - 1, len(ordered) - 1)])
+
+    distance, height = table["distance"], table["final_height"]
+    probes = np.column_stack([table[f"d{k}"] for k in PROBES])
+    limits = np.array([calibrated(column, 1 - 0.05 / len(PROBES)) for column in probes.T])
+    limits = np.where(np.isfinite(limits), limits, probes[own].max(axis=0))
+    return {
+        "monitor": (table["score"], float(table["threshold"][0])),
+        "futures alone": (table["alone"], float(table["alone_threshold"][0])),
+        "distance": (distance, calibrated(distance)),
+        "quantile of each sample": ((probes / limits).max(axis=1), 1.0),
+        "regions": (table["regions"], 1.0),
+        "final height": (height, calibrated(height)),
+    }
+
+
+def auroc(normal: np.ndarray, wrong: np.ndarray) -> float:
+    """Probability that a fault scores higher than a normal execution; equal scores count half."""
+    above = (wrong[:, None] > normal).mean() + 0.5 * (wrong[:, None] == normal).mean()
+    return float(above)
+
+
+def about_faults(table: Table) -> dict[str, Any]:
+    """Detection, delay, causes and rests of executions with faults."""
+    alarms = pick(table, table["alarm"] >= 0)
+    delays = (alarms["alarm"] - alarms["deviates"])[alarms["deviates"] >= 0]
+    wanted = np.array([CAUSES[str(part)] for part in alarms["part"]], dtype=object)
+    there = alarms["alarm_rest"] >= 0
+    ratios = alarms["alarm_rest"][there] / np.maximum(alarms["alarm_before"][there], 1e-6)
+    many = len(wanted) > 0
+    return {
+        "executions": len(table["part"]),
+        "detected": len(wanted) / len(table["part"]),
+        "delay": float(np.median(delays)) if len(delays) else None,
+        "delay_95": float(np.quantile(delays, 0.95)) if len(delays) else None,
+        "cause": float(np.mean(alarms["cause"] == wanted)) if many else None,
+        "cause_later": float(np.mean(alarms["cause_later"] == wanted)) if many else None,
+        "rest": float(np.median(ratios)) if len(ratios) else None,
+    }
+
+
+def about_rests(table: Table) -> dict[str, Any]:
+    """Rests of normal executions after some samples in motion."""
+    found = {}
+    for name, drops in (("stays on the blade", 0), ("slips later", 1)):
+        mine = pick(table, (table["ten_rest"] >= 0) & (table["ten_drops"] == drops))
+        if len(mine["part"]):
+            found[name] = {
+                "executions": len(mine["part"]),
+                "ratio": float(mine["ten_rest"].mean() / mine["ten_before"].mean()),
+                "held": float(mine["ten_held"].mean()),
+                "slip": float(mine["ten_slip"].mean()),
+            }
+    return found
+
+
+def confusion(table: Table) -> str:
+    """Table of the causes that are named 0.3 s after alarms."""
+    alarms = pick(table, (table["alarm"] >= 0) & is_wrong(table))
+    named = sorted({str(cause) for cause in alarms["cause_later"]})
+    lines = [
+        [
+            fault,
+            *(
+                str(int(np.sum((alarms["part"] == fault) & (alarms["cause_later"] == name))))
+                for name in named
+            ),
+        ]
+        for fault in FAULTS
+        if (alarms["part"] == fault).any()
+    ]
+    return markdown_table(["Fault, and the cause that is named 0.3 s after the alarm", *named], lines)
+
+
+def percent(value: float | None) -> str:
+    """A share as it stands in tables."""
+    return "" if value is None else f"{100 * value:.0f} %"

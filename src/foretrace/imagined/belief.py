@@ -1,0 +1,151 @@
+"""What is believed of an execution's constants: weighted particles, drawn from a prior, or what was learned."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import qmc
+
+from foretrace.errors import PredictionError, check_type, is_number, is_whole, shown
+
+RANGES: Mapping[str, tuple[float, float]] = {
+    "friction": (0.5, 1.1),
+    "tool_friction": (0.2, 0.45),
+    "density": (300.0, 1200.0),
+    "com_x": (0.0, 0.0),
+    "com_y": (0.0, 0.0),
+    "contact_ahead": (-0.003, 0.003),
+    "contact_left": (-0.003, 0.003),
+    "contact_turn": (-float(np.deg2rad(3.0)), float(np.deg2rad(3.0))),
+}
+"""Ranges of the default prior, those of randomised data sets [SI]. ``com_x`` and ``com_y``: distance of the centre of
+mass from where it was given or estimated, in the object frame. ``contact_...``: execution error (`ExecutionOffset`)."""
+EXECUTION = ("contact_ahead", "contact_left", "contact_turn")
+"""What differs between executions on the same object."""
+COM = ("com_x", "com_y")
+LEARNED = 0.8
+"""A constant counts as learned if its standard deviation is below this share of the prior's."""
+MOST = 1 << 20
+
+
+class Belief:
+    """Weighted particles over the constants of executions on one object: a prior, or what `foretrace.identify` learned.
+
+    Given as ``context``, an imaginer averages over it.
+
+    Args:
+        ranges: Ranges by name, in place of those of `RANGES`: constants are drawn uniformly from them [SI]. Equal ends
+            fix a constant.
+        worlds: Number of draws that an imaginer imagines one action in.
+        particles: Number of particles.
+        seed: Decides how they are drawn.
+
+    Raises:
+        PredictionError: A name is unknown, a range is none, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        ranges: Mapping[str, Any] | None = None,
+        *,
+        worlds: int = 256,
+        particles: int = 4096,
+        seed: int = 0,
+    ) -> None:
+        check_type("ranges", ranges, (Mapping, type(None)), PredictionError, "ranges by name")
+        for name, value, least, most in (
+            ("worlds", worlds, 2, 65536),
+            ("particles", particles, 2, MOST),
+            ("seed", seed, 0, 2**63 - 1),
+        ):
+            if not is_whole(value, least, most):
+                raise PredictionError(f"{name} is {shown(value)}: give a whole number from {least} to {most}")
+        limits = dict(RANGES) | {name: _range(name, pair) for name, pair in (ranges or {}).items()}
+        shares = qmc.Sobol(len(limits), rng=np.random.default_rng(seed)).random(particles)
+        low, high = np.array(list(limits.values())).T
+        self.names: tuple[str, ...] = tuple(limits)
+        """Names of the constants."""
+        self.values: Float[np.ndarray, "particles names"] = low + shares * (high - low)
+        """Values of the particles [SI]."""
+        self.weights: Float[np.ndarray, " particles"] = np.full(particles, 1 / particles)
+        """Their weights, which sum to 1."""
+        self.worlds = worlds
+        """Number of draws that an imaginer imagines one action in."""
+        self.prior_std: Mapping[str, float] = self.std
+        """Standard deviations before anything was observed."""
+        self.ranges: Mapping[str, tuple[float, float]] = limits
+        """Ranges of the prior."""
+
+    def updated(
+        self, values: Float[np.ndarray, "particles names"], weights: Float[np.ndarray, " particles"]
+    ) -> "Belief":
+        """The same constants with other particles."""
+        found = object.__new__(Belief)
+        found.__dict__ = {
+            **{name: each for name, each in self.__dict__.items() if name not in ("mean", "std", "learned")},
+            "values": values,
+            "weights": weights / weights.sum(),
+        }
+        return found
+
+    @cached_property
+    def mean(self) -> dict[str, float]:
+        """Mean of each constant [SI]."""
+        return dict(zip(self.names, (self.weights @ self.values).tolist(), strict=True))
+
+    @cached_property
+    def std(self) -> dict[str, float]:
+        """Standard deviation of each constant [SI]."""
+        off = self.values - self.weights @ self.values
+        return dict(zip(self.names, np.sqrt(self.weights @ off**2).tolist(), strict=True))
+
+    @cached_property
+    def learned(self) -> tuple[str, ...]:
+        """Constants that observation has told something about; all others keep their prior."""
+        return tuple(name for name in self.names if self.std[name] < LEARNED * self.prior_std[name])
+
+    def __repr__(self) -> str:
+        words = [f"{name} {self.mean[name]:.3g} ± {self.std[name]:.2g}" for name in self.learned]
+        kept = [name for name in self.names if name not in self.learned and self.prior_std[name] > 0]
+        return f"Belief({', '.join(words) or 'nothing learned'}; prior: {', '.join(kept) or 'none'})"
+
+    def sample(self, n: int, rng: np.random.Generator | None = None) -> dict[str, Float[np.ndarray, " n"]]:
+        """Draws of the constants, by name [SI].
+
+        Particles are drawn evenly along their cumulative weights, and each is moved a little, by as much as they are
+        apart, so that a few heavy ones do not repeat exactly. They stay within the prior's ranges.
+
+        Args:
+            n: Number of draws.
+            rng: Random numbers; by default always the same.
+
+        Raises:
+            PredictionError: n is no number from 1 on.
+        """
+        if not is_whole(n, 1, MOST):
+            raise PredictionError(f"n is {shown(n)}: give a number of draws from 1 to {MOST}")
+        check_type("rng", rng, (np.random.Generator, type(None)), PredictionError)
+        rng = np.random.default_rng(0) if rng is None else rng
+        places = (np.arange(n) + rng.random()) / n
+        rows = np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)
+        width = len(self.weights) ** -0.2 * 0.5 * np.array([self.std[name] for name in self.names])
+        if np.ptp(self.weights) == 0:  # a prior's own particles: any that follow each other are evenly spread
+            rows = (np.arange(n) + rng.integers(len(self.weights))) % len(self.weights)
+            width = np.zeros_like(width)
+        low, high = np.array([self.ranges[name] for name in self.names]).T
+        moved = self.values[rows] + width * rng.normal(size=(n, len(self.names)))
+        drawn = np.clip(moved, low, high)[rng.permutation(n)]
+        return dict(zip(self.names, drawn.T, strict=True))
+
+
+def _range(name: object, pair: Any) -> tuple[float, float]:
+    if name not in RANGES:
+        raise PredictionError(
+            f"{shown(name)} is no constant of an execution: choose from {', '.join(RANGES)}"
+        )
+    fits = isinstance(pair, tuple | list) and len(pair) == 2 and all(map(is_number, pair))
+    if not fits or not -np.inf < pair[0] <= pair[1] < np.inf:
+        raise PredictionError(f"{name} has the range {shown(pair)}: give a least and a greatest number")
+    return float(pair[0]), float(pair[1])

@@ -1,0 +1,8 @@
+"""Monitoring: executions against what was imagined, and what they tell of the physics."""
+
+from foretrace.monitoring.calibration import MonitorCalibration
+from foretrace.monitoring.identification import identify
+from foretrace.monitoring.monitor import Monitor
+from foretrace.monitoring.verdict import Verdict
+
+__all__ = ["Monitor", "MonitorCalibration", "Verdict", "identify"]
