@@ -368,9 +368,6 @@ def test_worlds_of_a_belief(predictor):
     motion = ft.ObservedMotion(effect.times[:5], effect.pose_trajectory[:5])
     with pytest.raises(PredictionError, match="a belief is given as context"):
         predictor.imagine(view, ACTION, context=ft.Belief(), observed=motion)
-    batch = ft.InteractionBatch.from_views([view])
-    with pytest.raises(PredictionError, match="context is Belief"):
-        predictor.imagine_batch(batch, "estimated", context=ft.Belief())
 
 
 # --- the command ------------------------------------------------------------------------------------------------

@@ -186,7 +186,7 @@ def _aligned(futures: Futures, worlds: int) -> Futures:
             continue
         own = middles[:, slots].reshape(-1, worlds, 2, 2)
         seen = np.isfinite(own).all(axis=(2, 3))
-        edges = own[:, :1]
+        edges, swap = own[:, :1], np.zeros(own.shape[:2], dtype=bool)
         for _ in range(2):  # each world's two edges go with the nearer ones of the mean edges
             straight, swapped = (
                 np.linalg.norm(each - edges, axis=-1).sum(axis=-1) for each in (own, own[:, :, ::-1])
@@ -195,7 +195,7 @@ def _aligned(futures: Futures, worlds: int) -> Futures:
             sorted_own = np.where(swap[..., None, None], own[:, :, ::-1], own)
             edges = np.nan_to_num(sorted_own).mean(axis=1, keepdims=True)
         rows = np.flatnonzero(swap.ravel())
-        order[np.ix_(rows, slots)] = slots[::-1]
+        order[rows[:, None], np.array(slots)] = slots[::-1]
     if (order == np.arange(len(futures.outcome))).all():
         return futures
     rows = np.arange(len(futures))[:, None]

@@ -26,7 +26,7 @@ PARTICLES = 1024
 """Worlds in which the action is imagined in each round."""
 TEMPERS = (0.1, 0.4, 1.0)
 """Shares of the likelihood after each round: each round's worlds are drawn where those before it fit."""
-JITTER = 0.35
+JITTER = 0.25
 """Distance that particles are moved by between rounds, in standard deviations."""
 BEST = 24
 """Worlds of the last round that a second, exact imaginer plays again."""
