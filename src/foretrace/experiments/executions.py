@@ -112,7 +112,7 @@ def make_execution(seed: int, number: int, fault: str = "") -> Execution:
         if normal is None or poses is None:
             continue
         times = PERIOD * np.arange(len(normal))
-        tracked = _track(poses, times, fault, rng)
+        tracked = track(poses, times, fault, rng)
         return Execution(prism, action, view, physics, times, poses, normal, tracked, fault)
 
 
@@ -240,13 +240,20 @@ def _stretched(scene: Scene, factor: float) -> ObjectModel:
     return Prism(corners, prism.height, prism.bevel)
 
 
-def _track(
+def track(
     poses: Float[np.ndarray, "time 7"],
     times: Float[np.ndarray, " time"],
     fault: str,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "7"] | None, ...]:
-    """Poses with the tracker's noise, dropouts and faults."""
+    """Poses with the tracker's noise, dropouts and faults.
+
+    Args:
+        poses: True poses.
+        times: Their times [s].
+        fault: One of FAULTS, or empty.
+        rng: Random numbers.
+    """
     noisy = pose_to_matrix(poses)
     turned = rng.normal(scale=ANGLE_NOISE, size=(len(poses), 3))
     noisy[:, :3, :3] = quaternion_to_matrix(rotation_vector_to_quaternion(turned)) @ noisy[:, :3, :3]

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.ndimage import maximum_filter1d
 from scipy.special import logsumexp
 
 from foretrace.actions import Action
@@ -17,8 +18,7 @@ from foretrace.imagined.worlds import play_worlds
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Effect
 from foretrace.interactions.topdown import TopDownView
-from foretrace.monitoring.motions import TURN_LENGTH, band_width, place_of
-from foretrace.monitoring.motions import WIDTH as WIDTH_OF_BAND
+from foretrace.monitoring.motions import TURN_LENGTH, place_of
 
 COM_RANGE = 0.025
 """Range of the centre of mass about where it is seen, along each axis of the object frame, by default [m]."""
@@ -30,9 +30,11 @@ JITTER = 0.25
 """Distance that particles are moved by between rounds, in standard deviations."""
 BEST = 24
 """Worlds of the last round that a second, exact imaginer plays again."""
-WIDTH = 2e-3
+WIDTH = 1.5e-3
 """Width of the likelihood: error of the learned imaginer [m]. That of the exact one is half as wide."""
-RATE = 6.0
+SPEED_TIME = 0.02
+"""An object in motion may be ahead or behind by this time [s]."""
+RATE = 4.0
 """Independent observations in a second: residuals that follow each other closely are alike."""
 MOVING = 1e-3
 """Samples from the first one on that moves the object by this count [m]."""
@@ -120,26 +122,28 @@ def log_likelihood(
         motion: The observed motion; its poses alone count.
         width: Error of the imaginer [m].
     """
-    futures, times = played.futures, np.minimum(motion.times, played.times[-1])
+    inside = motion.times <= played.times[-1]
+    motion = ObservedMotion(motion.times[inside], motion.poses[inside])
+    futures, times = played.futures, motion.times
     world, slot = np.nonzero(futures.counted)
     states = futures.states[world, slot]
     points = states[:, 0, :3]
     relative = np.concatenate([states[..., :3] - points[:, None], TURN_LENGTH * states[..., 3:]], axis=-1)
-    band = width / WIDTH_OF_BAND * band_width(relative, played.times)
     place = np.interp(times, played.times, np.arange(len(played.times)))
     k = np.minimum(place.astype(int), len(played.times) - 2)
     share = (place - k)[:, None]
     expected = (1 - share) * relative[:, k] + share * relative[:, k + 1]
-    wide = (1 - share[:, 0]) * band[:, k] + share[:, 0] * band[:, k + 1]
     rest, turned = motion.poses[0], TURN_LENGTH * rotations_since_rest(motion.poses)
     moved = np.stack([place_of(pose, rest, points) for pose in motion.poses], axis=1)
     off = np.concatenate([moved, np.broadcast_to(turned, moved.shape)], axis=-1) - expected
-    square = (off**2).sum(axis=-1) / wide**2
+    # The observed motion's own speed decides, or slow worlds would be favoured for their narrow bands.
+    seen = np.concatenate([motion.poses[:, :3] - rest[:3], turned], axis=1)
+    speed = np.linalg.norm(np.gradient(seen, times, axis=0), axis=1) if len(times) > 1 else np.zeros(1)
+    square = (off**2).sum(axis=-1) / (width + SPEED_TIME * maximum_filter1d(speed, 3)) ** 2
     duration = np.minimum(np.diff(times, prepend=times[0]), LONGEST_STEP)
     moving = np.linalg.norm(np.concatenate([moved[0], turned], axis=1), axis=1) > MOVING
     counts = RATE * duration * np.maximum.accumulate(moving)
     log = -0.5 * (TAIL + 1) * (np.log1p(square / TAIL) * counts).sum(axis=1)
-    log = log - 3 * (np.log(wide) * counts).sum(axis=1)
     found = np.full(futures.probability.shape, -np.inf)
     found[world, slot] = log + np.log(futures.probability[world, slot])
     return np.asarray(logsumexp(found, axis=1))
