@@ -10,7 +10,7 @@ from foretrace.cli import main
 from foretrace.errors import MonitoringError, PredictionError
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined import LEVELS, Futures, ImaginedEffect
-from foretrace.monitoring import MonitorCalibration
+from foretrace.monitoring import Drift, MonitorCalibration
 from foretrace.monitoring.causes import BAD_INPUT, FROZEN, LOST, CauseModel
 from foretrace.monitoring.motions import motions_of, place_of
 from foretrace.simulation.collect import CollectConfig, collect
@@ -388,3 +388,41 @@ def test_the_command_draws_what_a_monitor_would_have_said(tmp_path, capsys):
     assert "has no interaction 99" in capsys.readouterr().err
     assert main([*arguments[:4], "watched.gif"]) == 2
     assert "choose a name that ends in" in capsys.readouterr().err
+
+
+# --- drift --------------------------------------------------------------------------------------------------------
+
+
+def executions_until(scores, seed: int) -> int | None:
+    drift = Drift(CALIBRATION, 0.01, seed)
+    return next((k for k, score in enumerate(scores, 1) if drift.update(float(score))), None)
+
+
+def test_drift_is_not_seen_where_there_is_none():
+    rng = np.random.default_rng(4)
+    found = [executions_until(rng.uniform(0.1, 2.0, 200), seed) for seed in range(200)]
+    assert np.mean([each is not None for each in found]) <= 0.03
+
+
+def test_drift_is_seen_within_thirty_executions():
+    rng = np.random.default_rng(5)
+    found = []
+    for seed in range(100):
+        before, after = rng.uniform(0.1, 2.0, 60), rng.uniform(1.2, 3.0, 60)
+        found.append(executions_until([*before, *after], seed))
+    late = [each - 60 if each is not None else 999 for each in found]
+    assert np.quantile(late, 0.95) <= 30
+
+
+def test_recalibration_from_the_last_scores():
+    drift = Drift(CALIBRATION)
+    for score in np.linspace(1, 3, 40):
+        drift.update(float(score))
+    assert drift.drifted
+    again = drift.recalibrate(20)
+    assert again.executions == 20
+    assert again.threshold(0.2) > CALIBRATION.threshold(0.2)
+    with pytest.raises(MonitoringError, match="there are 40 scores"):
+        drift.recalibrate(41)
+    with pytest.raises(MonitoringError, match="score is -1"):
+        drift.update(-1.0)

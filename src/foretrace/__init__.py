@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from foretrace.interactions.dataset import Dataset, InteractionBatch
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
-    from foretrace.monitoring import Monitor, MonitorCalibration, Verdict, identify
+    from foretrace.monitoring import Drift, Monitor, MonitorCalibration, Verdict, identify
     from foretrace.objects import (
         Bevel,
         Box,
@@ -50,7 +50,7 @@ _HOMES = {
     "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
-    "foretrace.monitoring": ("Monitor", "MonitorCalibration", "Verdict", "identify"),
+    "foretrace.monitoring": ("Drift", "Monitor", "MonitorCalibration", "Verdict", "identify"),
     "foretrace.objects": (
         *("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "Weighted"),
         *("paper_objects", "sample_prism"),
@@ -82,6 +82,7 @@ __all__ = [
     "CollectConfig",
     "Cylinder",
     "Dataset",
+    "Drift",
     "Effect",
     "EffectPredictor",
     "FeatureExtractor",
