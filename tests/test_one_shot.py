@@ -11,6 +11,7 @@ from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
+from foretrace.features.pivot_edges import NUM_VALUES, PROBES, RIM, find_pivot_edges
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import FLOOR, LEVELS, Futures, quantiles_of
@@ -20,7 +21,6 @@ from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW
 from foretrace.objects import sample_prism
 from foretrace.predictor import OneShotConfig, OneShotPredictor
 from foretrace.predictor.mixture import along_edges
-from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, RIM, find_pivot_edges
 from foretrace.predictor.states import encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error

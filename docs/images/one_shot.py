@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
 
 from foretrace.actions import LeverUp
+from foretrace.features.pivot_edges import NUM_VALUES, RIM, find_pivot_edges
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.interactions.hull import fit_hull
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import Prism
 from foretrace.pictures.style import INK, OBJECT_COLOR, OBJECT_EDGE, STYLE, TOOL_COLOR
-from foretrace.predictor.pivot_edges import NUM_VALUES, RIM, find_pivot_edges
 
 CORNERS = np.array(
     [[0.055, -0.045], [0.075, 0.012], [0.03, 0.055], [-0.03, 0.045], [-0.06, -0.01], [-0.035, -0.05]]

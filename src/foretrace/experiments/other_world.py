@@ -32,7 +32,7 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import PAPER_SIZES, Split, scaled_sizes
 from foretrace.pictures.style import new_figure, styled
-from foretrace.predictor.run_folder import fingerprint
+from foretrace.predictor.run_folder import fingerprint, processor_independent_fingerprint
 from foretrace.predictor.states import valid_samples
 from foretrace.twin import TwinConfig, TwinImaginer
 from foretrace.twin.residual import train_residual
@@ -116,7 +116,7 @@ class OtherWorld(Experiment):
             return None
         own = {name: value for name, value in vars(self.residual).items() if name != "seed"}
         recipe = {"predictor": self._recipe.describe(), "residual": own, "proportional": self.proportional}
-        return {"data": fingerprint(self._levered), "recipe": recipe}
+        return {"data": processor_independent_fingerprint(self._levered), "recipe": recipe}
 
     def run(self, trial: OtherWorldTrial, folder: Path) -> Sequence[Row]:
         """Errors [cm] on lever-ups that were not learned from."""

@@ -39,7 +39,7 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES
 from foretrace.predictor import PREDICTORS
 from foretrace.predictor.config import Device
-from foretrace.predictor.run_folder import fingerprint
+from foretrace.predictor.run_folder import processor_independent_fingerprint
 
 FITTED = "fitted"
 """Folder within the results for what features have learned on their own."""
@@ -101,7 +101,7 @@ class Paper(Experiment):
         recipes = {name: self._recipe(name).describe() for name in own}
         options = {label: dict(chosen) for label, chosen in self.feature_options.items()}
         recipe = {"predictors": recipes, "feature_options": options, "proportional": self.proportional}
-        return {"data": fingerprint(self._levered), "recipe": recipe}
+        return {"data": processor_independent_fingerprint(self._levered), "recipe": recipe}
 
     def run(self, trial: PaperTrial, folder: Path) -> Sequence[Row]:
         """Accuracies, or errors [cm]; and the seconds of the training."""
@@ -171,7 +171,8 @@ class Paper(Experiment):
         if trial.features in FEATURES:
             steps = int(trial.setting) if comparison.varies_steps else None
             features = {"features": trial.features, "feature_options": self._options(trial)}
-            return self._recipe(BASE).change(**features, steps_ahead=steps, **where)
+            varied = comparison.varied.get(trial.setting, {})
+            return self._recipe(BASE).change(**features, steps_ahead=steps, **varied, **where)
         predictor, options = comparison.predictors.get(trial.features, (trial.features, {}))
         return self._recipe(predictor).change(**options, **where)
 
@@ -186,7 +187,7 @@ class Paper(Experiment):
 
     def _inputs(self, recipe: Recipe) -> Tensor:
         """Inputs of features for the whole data set, once in each process."""
-        key = json.dumps([recipe.features, recipe.feature_options], sort_keys=True)
+        key = json.dumps([recipe.features, recipe.predictor.make_features().options], sort_keys=True)
         if key not in self._known_inputs:
             self._known_inputs[key] = recipe.inputs(self._levered)
         return self._known_inputs[key]

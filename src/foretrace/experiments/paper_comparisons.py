@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from foretrace.evaluation.claims import Cell
 from foretrace.evaluation.experiment import Trial, checked_seeds, chosen
 from foretrace.evaluation.statistics import TEST_TO_TRAIN
 from foretrace.experiments.training import BASE
-from foretrace.features import FEATURES, Option, Outline
+from foretrace.features import FEATURES, Option, Outline, PivotEdgeFeatures
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.splits import (
     PAPER_SIZES,
@@ -60,8 +61,10 @@ class Comparison:
     """Whether the choice of support corners is evaluated, and no predictor trained."""
     varies_steps: bool = False
     """Whether the setting is the number of states predicted per iteration."""
+    varied: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Settings of predictor and training that a setting of the comparison stands for."""
     on_request: bool = False
-    """Whether it is carried out only where it is named: it needs more data than the paper's."""
+    """Whether it is carried out only where it is named: it needs more data than the paper's, or many hours."""
 
 
 def shuffled(batch: InteractionBatch, setting: str, seed: int, proportional: bool) -> Split:
@@ -133,7 +136,7 @@ _PLAIN_SUPPORT: dict[str, dict[str, Option]] = {
     "sp-pred": {"aligned": False, "snapped": False, "epochs": 500, "batch_size": 32},
     "sp-rule": {"setback": 0.0, "half_width": 0.0},
 }
-_FEATURES = tuple(label for label in FEATURES if label != Outline.label)
+_FEATURES = tuple(label for label in FEATURES if label not in (Outline.label, PivotEdgeFeatures.label))
 _OTHERS = tuple(label for label in PREDICTORS if label != BASE)
 """Predictors that are compared as they are, each with its own features, as if they were other features."""
 _ALL = (*_FEATURES, *_OTHERS)
@@ -142,8 +145,14 @@ ABLATIONS: dict[str, tuple[str, Mapping[str, Option]]] = {
     "one network": ("one-shot", {"ensemble": 1}),
     "no mirror": ("one-shot", {"mirrored": False}),
     "8 motions": ("one-shot", {"components": 8}),
+    "none of these": ("one-shot", {"pivot_edges": 1, "ensemble": 1, "mirrored": False}),
 }
-"""What the direct trajectory predictor is without one of its parts."""
+"""What the direct trajectory predictor is without some of its parts."""
+LONGER: dict[str, Mapping[str, Any]] = {
+    "60 epochs": {"epochs": 60},
+    "60 epochs, mirrored": {"epochs": 60, "mirrored": True},
+}
+"""Longer trainings of the paper's predictors; and also in the mirror."""
 
 COMPARISONS: dict[str, Comparison] = {
     "support-points": Comparison(
@@ -167,6 +176,9 @@ COMPARISONS: dict[str, Comparison] = {
         ("none", *_OTHERS), ("2000", "5000", "10000", "20000"), _count_of_all, on_request=True,
         ratio=lambda setting: PAPER_SIZES[2] / int(setting),
     ),
+    "longer": Comparison(
+        (*_FEATURES, PivotEdgeFeatures.label), tuple(LONGER), shuffled, varied=LONGER, on_request=True
+    ),
     "ablation": Comparison(tuple(ABLATIONS), ("shuffled",), shuffled, predictors=ABLATIONS),
 }  # fmt: skip
 """The paper's comparisons by name: figures 9a, 9b, 10, 11, 12 and 13.
@@ -175,8 +187,10 @@ Two ask what our choices change: in ``support-points-plain`` the network sees co
 points as they are, and the rule lifts at the contact point; ``half-plane`` counts only what of an outline lies ahead of
 the levered edge.
 
-``more-data``, on request, goes on from figure 11 with a data set of more objects than the paper's. ``ablation`` takes
-parts away from the direct trajectory predictor.
+``longer``, on request, trains the paper's predictors for 60 epochs instead of 15, and also with mirror images, as the
+direct trajectory predictor is trained; one of them observes that one's numbers. ``more-data``, on request, goes on from
+figure 11 with a data set of more objects than the paper's. ``ablation`` takes parts away from the direct trajectory
+predictor.
 
 One state ahead, the first setting of figure 12, is ``features`` ``shuffled``.
 """

@@ -22,7 +22,7 @@ from foretrace.predictor import (
     fit_predictor,
     train_predictor,
 )
-from foretrace.predictor.checkpoint import ADDED, default_checkpoint
+from foretrace.predictor.checkpoint import default_checkpoint
 from foretrace.predictor.run_folder import MODEL, Progress
 from foretrace.predictor.states import valid_lengths
 from foretrace.predictor.training import RUNTIME
@@ -82,7 +82,9 @@ class Recipe:
         """What decides the weights beside data and trial, JSON-able."""
         predictor, training = asdict(self.predictor), asdict(self.training)
         # A setting that is younger than kept results is named only where it is not what it was for these.
-        unchanged = {name for name in ADDED if predictor[name] == getattr(type(self.predictor), name)}
+        unchanged = {
+            name for name in self.predictor.added if predictor[name] == getattr(type(self.predictor), name)
+        }
         left_out = {*OF_THE_TRIAL, *RUNTIME, *unchanged}
         return {
             "predictor": {name: value for name, value in predictor.items() if name not in left_out},

@@ -34,7 +34,7 @@ from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_co
 from foretrace.objects import Box, Cylinder
 from foretrace.pictures.style import INK, new_figure, styled
 from foretrace.predictor import load_predictor
-from foretrace.predictor.run_folder import fingerprint
+from foretrace.predictor.run_folder import processor_independent_fingerprint
 from foretrace.predictor.states import valid_lengths, valid_samples
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.twin import TwinConfig, TwinImaginer
@@ -143,7 +143,7 @@ class Twin(Experiment):
         if self.data is None:
             return None
         return {
-            "data": fingerprint(self._levered),
+            "data": processor_independent_fingerprint(self._levered),
             "recipe": self._recipe("shuffled", 0).describe(),
             "proportional": self.proportional,
         }

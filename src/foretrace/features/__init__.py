@@ -13,6 +13,7 @@ from foretrace.features.base import (
 )
 from foretrace.features.cnn import ImageCnn, ShapeContextCnn
 from foretrace.features.outline import Outline
+from foretrace.features.pivot_edges import PivotEdgeFeatures
 from foretrace.features.shape_context import ShapeContext200, ShapeContext800, ShapeContext3200
 from foretrace.features.support_points import (
     ObservedSupportPoints,
@@ -24,7 +25,7 @@ from foretrace.features.support_points import (
 FEATURES.arrange(
     (
         *("none", "im-cnn", "sc-cnn", "sc-200", "sc-800", "sc-3200"),
-        *("ae-256", "ae-512", "sp-rule", "sp-pred", "sp-truth", "outline"),
+        *("ae-256", "ae-512", "sp-rule", "sp-pred", "sp-truth", "outline", "pivot-edge"),
     )
 )
 
@@ -39,6 +40,7 @@ __all__ = [
     "ObservedSupportPoints",
     "Option",
     "Outline",
+    "PivotEdgeFeatures",
     "Precision",
     "PredictedSupportPoints",
     "ShapeContext200",

@@ -20,6 +20,9 @@ from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, Weighted
 
+IN_MIRROR = np.array([1.0, -1.0, 1.0])
+"""Factors of a vector's coordinates in a mirror along the action axis."""
+
 
 @dataclass(frozen=True)
 class InteractionBatch:
@@ -84,6 +87,24 @@ class InteractionBatch:
                 f"size of a batch is {shown(size)}: give a number of rows from 1 on"
             )
         return (self[start : start + size] for start in range(0, len(self), size))
+
+    def mirrored(self) -> "InteractionBatch":
+        """The same interactions in a mirror along the action axis: left is right.
+
+        The grid of the views is its own mirror image, so that no pixel is drawn anew. Object frames are mirrored, too.
+        """
+        order = np.arange(self.corners.shape[1])
+        backwards = self.num_corners[:, None] - 1 - order  # corners stay counter-clockwise
+        order = np.where(backwards >= 0, backwards, order)
+        return replace(
+            self,
+            mask=np.ascontiguousarray(self.mask[:, :, ::-1]),
+            height=np.ascontiguousarray(self.height[:, :, ::-1]),
+            corners=np.take_along_axis(self.corners, order[..., None], axis=1) * IN_MIRROR[:2],
+            com=self.com * IN_MIRROR,
+            pose=self.pose * [*IN_MIRROR, 1, -1, 1, -1],
+            support_points=np.ascontiguousarray(self.support_points[:, ::-1] * IN_MIRROR[:2]),
+        )
 
     @classmethod
     def from_interactions(cls, interactions: Sequence[Interaction]) -> "InteractionBatch":

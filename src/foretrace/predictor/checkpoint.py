@@ -26,8 +26,6 @@ CONFIG = "config.json"
 MODEL = "model.safetensors"
 DEFAULT = "default"
 """Folder of the predictor that comes with the package."""
-ADDED = {"hidden_share"}
-"""Settings that earlier checkpoints do not have; they had what is the default."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
 UNBOUNDED = "quantiles"
@@ -227,7 +225,9 @@ def _make(content: PredictorEntries, file: Path) -> EffectPredictor:
     settings = content["config"]
     try:
         config_class = PREDICTORS.find(content["predictor"]).config_class
-        if odd := sorted({field.name for field in fields(config_class)} ^ (settings.keys() | ADDED)):
+        if odd := sorted(
+            {field.name for field in fields(config_class)} ^ (settings.keys() | {*config_class.added})
+        ):
             raise CheckpointError(f"{file}: missing or unknown settings {', '.join(odd)}; train anew")
         tuples: dict[str, Any] = {
             name: tuple(value) for name, value in settings.items() if isinstance(value, list)

@@ -133,6 +133,8 @@ class PredictorConfig:
     """The class that is made; set when that is defined."""
     training: ClassVar[TrainConfig] = TrainConfig()
     """Recommended settings of its training."""
+    added: ClassVar[tuple[str, ...]] = ("hidden_share",)
+    """Settings that earlier checkpoints and results do not have; they had what is the default."""
 
     features: str = "none"
     """Features of the object that the predictor is given, by their label."""

@@ -8,10 +8,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features import Precision
+from foretrace.features import FeatureExtractor, Precision
+from foretrace.features.mirror import MirroredFeatures
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.config import PredictorConfig, check_choice, check_count, check_flag
-from foretrace.predictor.states import STATE_GROUPS, Effects, StateKind, state_size
+from foretrace.predictor.states import STATE_GROUPS, STATES_IN_MIRROR, Effects, StateKind, state_size
 
 CHANGE_SCALE = 0.1
 """Normalised states change by about this much in one sample: the dense layer's numbers stay of unit scale."""
@@ -20,6 +21,8 @@ CHANGE_SCALE = 0.1
 @dataclass(frozen=True, kw_only=True)
 class LstmConfig(PredictorConfig):
     """Settings of the paper's predictor."""
+
+    added = (*PredictorConfig.added, "mirrored")
 
     features: str = "im-cnn"
     """Features of the object that the predictor is given, by their label."""
@@ -33,6 +36,8 @@ class LstmConfig(PredictorConfig):
     """States per training sequence. The LSTM's memory is carried from window to window, its gradient is not."""
     residual: bool = True
     """Predict changes of the state; else states themselves, as in the paper."""
+    mirrored: bool = False
+    """Whether every lever-up is also learned from in the mirror, and predictions are means over both images."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -41,6 +46,12 @@ class LstmConfig(PredictorConfig):
         check_count("hidden", self.hidden, 4096)
         check_count("window", self.window, 1_000_000)
         check_flag("residual", self.residual)
+        check_flag("mirrored", self.mirrored)
+
+    def make_features(self) -> FeatureExtractor:
+        """The feature extractor; for both images where lever-ups are also seen in the mirror."""
+        features = super().make_features()
+        return MirroredFeatures(features) if self.mirrored else features
 
 
 class ProjectedLstm(nn.Module):
@@ -204,7 +215,8 @@ class LstmPredictor(EffectPredictor):
     def __init__(self, config: LstmConfig, num_samples: int):
         super().__init__(config, num_samples, config.state)
         size = state_size(config.state)
-        self.lstm = ProjectedLstm(size, self.num_inputs, config.hidden)
+        seen = self.features.num_features // 2 if config.mirrored else 0  # what comes twice
+        self.lstm = ProjectedLstm(size, self.num_inputs - seen, config.hidden)
         self.output = nn.Linear(config.hidden, config.steps_ahead * size)
         nn.init.xavier_uniform_(self.output.weight)
         nn.init.zeros_(self.output.bias)
@@ -213,6 +225,11 @@ class LstmPredictor(EffectPredictor):
     def display_name(self) -> str:
         """Name in figures and tables."""
         return f"{self.features.label} + LSTM"
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether mirror images have mirrored motions, exactly."""
+        return self.config.mirrored
 
     @property
     def feature_weights(self) -> list[nn.Parameter]:
@@ -231,6 +248,9 @@ class LstmPredictor(EffectPredictor):
         anew in the middle of a trajectory could not tell how long an object at rest has been at rest.
         """
         states, lengths = effects.states, effects.lengths
+        if self.config.mirrored:
+            features = self._both_images(features)
+            states, lengths = torch.cat([states, self._mirror(states)]), lengths.repeat(2)
         time = states.shape[1]
         ahead = self.config.steps_ahead
         projected = self.lstm.project(features)
@@ -249,6 +269,15 @@ class LstmPredictor(EffectPredictor):
         self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch time state"]:
         """Feed predictions back, n states per iteration, until the trajectory is whole."""
+        if not self.config.mirrored:
+            return self._roll_out(features, first)
+        both = self._roll_out(self._both_images(features), torch.cat([first, self._mirror(first)]))
+        own, other = both.chunk(2)
+        return (own + self._mirror(other)) / 2
+
+    def _roll_out(
+        self, features: Float[Tensor, "batch inputs"], first: Float[Tensor, "batch state"]
+    ) -> Float[Tensor, "batch time state"]:
         projected = self.lstm.project(features)
         states, new = [first], [first]
         memory = None
@@ -259,6 +288,17 @@ class LstmPredictor(EffectPredictor):
             new = self._next_states(memory[0], states[-1]).unbind(1)
             states += new
         return torch.stack(states[: self.num_samples], dim=1)
+
+    def _both_images(self, inputs: Float[Tensor, "batch inputs"]) -> Float[Tensor, "images inputs"]:
+        """Features and context of all lever-ups, and then of their mirror images."""
+        seen = self.features.num_features // 2
+        own, other, context = inputs.tensor_split([seen, 2 * seen], dim=1)
+        return torch.cat([torch.cat([each, context], dim=1) for each in (own, other)])
+
+    def _mirror(self, states: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch state"]:
+        """Normalised states in the mirror."""
+        sign = states.new_tensor(STATES_IN_MIRROR[self.state])
+        return sign * states + (sign - 1) * self.state_mean / self.state_scale
 
     def _next_states(
         self, outputs: Float[Tensor, "*batch hidden"], current: Float[Tensor, "*batch state"]

@@ -13,6 +13,7 @@ from foretrace.errors import TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
 from foretrace.features.outline import HEIGHT_CELLS
+from foretrace.features.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
 from foretrace.imagined import (
     LEVELS,
     STARTS,
@@ -35,7 +36,6 @@ from foretrace.predictor.config import (
 )
 from foretrace.predictor.ensemble import MANY, Ensemble
 from foretrace.predictor.mixture import COORDINATES, TURN_LENGTH, Mixture, along_edges
-from foretrace.predictor.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
 from foretrace.predictor.states import Effects, decode_poses
 from foretrace.predictor.temperature import Odds, fit_temperatures, tempered
 from foretrace.predictor.traced import TracedDistribution

@@ -24,6 +24,13 @@ with the rotation as axis times angle, which grows beyond half a turn where an o
 STATE_GROUPS: dict[StateKind, tuple[int, ...]] = {"position": (3,), "pose": (3, 6), "turn": (3, 3)}
 """Sizes of the parts of a state that share one unit, and therefore one scale."""
 
+STATES_IN_MIRROR: dict[StateKind, tuple[int, ...]] = {
+    "position": (1, -1, 1),
+    "pose": (1, -1, 1, 1, -1, 1, -1, 1, -1),
+    "turn": (1, -1, 1, -1, 1, -1),
+}
+"""Factors of a state's coordinates in a mirror along the action axis."""
+
 PIECE = 2048
 """Trajectories of a large part that are looked at together."""
 

@@ -18,6 +18,7 @@ from foretrace.errors import (
 )
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
+from foretrace.features.pivot_edges import find_pivot_edges
 from foretrace.files import as_path, make_folder, read_versioned, write_json
 from foretrace.geometry import rotation_vector_to_quaternion
 from foretrace.imagined import (
@@ -33,7 +34,6 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.hull import MAX_CORNERS
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
 from foretrace.predictor.mixture import TURN_LENGTH
-from foretrace.predictor.pivot_edges import find_pivot_edges
 from foretrace.predictor.runtime import seeded, thread_count
 from foretrace.twin.imaginer import TwinImaginer
 from foretrace.twin.residual_network import Priors, ResidualConfig, ResidualNetwork

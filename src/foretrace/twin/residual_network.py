@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foretrace.errors import TrainingError, check_ranges, is_whole, shown
+from foretrace.features.pivot_edges import NUM_VALUES
 from foretrace.imagined import LEVELS
 from foretrace.predictor.ensemble import Ensemble
 from foretrace.predictor.mixture import COORDINATES, along_edges
-from foretrace.predictor.pivot_edges import NUM_VALUES
 from foretrace.predictor.trajectory_basis import find_basis
 
 SAME = 0.01

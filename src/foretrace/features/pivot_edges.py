@@ -7,13 +7,18 @@ of it is in closed form from the hull's corners and the centre of mass.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from foretrace.features.base import UNIT
+from foretrace.features.base import UNIT, FeatureExtractor
+from foretrace.features.outline import Outline
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
+from foretrace.geometry import polygon_centroid
+from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS, mask_contour
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.objects import BEVEL
 
@@ -218,6 +223,36 @@ def _probe(
     places = ((2 * pixels + 1) / VIEW_SIZE - 1).flip(-1)
     found = F.grid_sample(heights[:, None], places, align_corners=False)
     return found[:, 0].unflatten(-1, (PROBES, PROBES)) / UNIT
+
+
+class PivotEdgeFeatures(FeatureExtractor):
+    """``pivot-edge``: a lever-up relative to the edge ahead of the centre of mass; not in the paper.
+
+    The ``NUM_VALUES`` numbers with which the direct trajectory predictor describes its first candidate edge, from the
+    view alone.
+    """
+
+    label = "pivot-edge"
+
+    @property
+    def num_features(self) -> int:
+        """The numbers that describe a lever-up relative to one edge."""
+        return NUM_VALUES
+
+    def inputs(self, batch: InteractionBatch) -> Float[Tensor, "batch 27"]:
+        """The numbers themselves, with the centre of mass above that of the mask's area, at half the object's height.
+
+        Raises:
+            PredictionError: A mask is empty.
+        """
+        corners = UNIT * Outline().inputs(batch).unflatten(1, (MAX_CORNERS, 2))
+        centres = [polygon_centroid(mask_contour(batch, row)) for row in range(len(batch))]
+        com = np.column_stack([np.reshape(centres, (-1, 2)), batch.height.max(axis=(1, 2), initial=0.0) / 2])
+        return find_pivot_edges(corners, torch.from_numpy(com).float(), 1).values[:, 0, 0]
+
+    def forward(self, inputs: Float[Tensor, "batch 27"]) -> Float[Tensor, "batch 27"]:
+        """Hand them on."""
+        return inputs
 
 
 def _turn(before: Tensor, after: Tensor) -> Tensor:
