@@ -14,12 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import factories
+from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError
 from foretrace.files import PARTIAL, sole_writer
+from foretrace.geometry import polygon_area, quaternion_to_matrix
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import Interaction, Outcome
+from foretrace.objects import Prism
+from foretrace.simulation.lever_up import simulate
 
 
 def write_dataset(folder: Path, interactions: list[Interaction], shard_size: int = 8) -> Path:
@@ -172,6 +176,31 @@ def test_batch_of_interactions_and_of_rows(interactions):
     np.testing.assert_array_equal(some.com[1], batch.com[2])
     np.testing.assert_array_equal(some.times, batch.times)
     assert len(batch[batch.outcome == "slipped"]) == 2
+
+
+def test_a_mirrored_batch_is_that_of_the_mirrored_object():
+    """As if the mirrored object had been levered."""
+    prism = Prism([(0.083, 0.011), (0.017, 0.079), (-0.071, 0.049), (-0.079, -0.043), (0.031, -0.077)], 0.02)
+    other = Prism(prism.corners[::-1] * [1, -1], 0.02)
+    batch, image = (
+        InteractionBatch.from_interactions([simulate(each, LeverUp(contact, direction), embodiment="tool")])
+        for each, contact, direction in (
+            (prism, (-0.075, 0.003), (1.0, -0.087)),
+            (other, (-0.075, -0.003), (1.0, 0.087)),
+        )
+    )
+    found = batch.mirrored()
+    np.testing.assert_array_equal(found.mask, image.mask)
+    for name in ("height", "support_points", "com"):
+        np.testing.assert_allclose(getattr(found, name), getattr(image, name), atol=1e-4, err_msg=name)
+    assert {*np.round(found.corners[0], 6).flat} == {*np.round(image.corners[0], 6).flat}
+    assert polygon_area(found.corners[0]) > 0
+    turned, expected = (quaternion_to_matrix(each.pose[0, -1, 3:]) for each in (found, image))
+    np.testing.assert_allclose(turned, expected, atol=0.01)
+    for each in fields(batch):
+        if each.name != "parameters":
+            again, at_first = getattr(found.mirrored(), each.name), getattr(batch, each.name)
+            np.testing.assert_array_equal(again, at_first, err_msg=each.name)
 
 
 def test_batch_refuses_different_sample_times(interactions):

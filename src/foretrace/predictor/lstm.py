@@ -289,7 +289,7 @@ class LstmPredictor(EffectPredictor):
             states += new
         return torch.stack(states[: self.num_samples], dim=1)
 
-    def _both_images(self, inputs: Float[Tensor, "batch inputs"]) -> Float[Tensor, "images inputs"]:
+    def _both_images(self, inputs: Float[Tensor, "batch inputs"]) -> Float[Tensor, "images own"]:
         """Features and context of all lever-ups, and then of their mirror images."""
         seen = self.features.num_features // 2
         own, other, context = inputs.tensor_split([seen, 2 * seen], dim=1)
