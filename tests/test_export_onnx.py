@@ -133,7 +133,6 @@ def test_a_file_tells_what_it_is(command):
     assert list(facts["quantiles"]) == kinds
     for found, wanted in zip(facts["quantiles"].values(), predictor.quantiles.flatten(0, 1), strict=True):
         assert found == pytest.approx(wanted.tolist())
-    assert facts["start_error"] == pytest.approx(float(predictor.start_error[1]))
     assert facts["config"]["feature_options"] == {"heights": True}
     assert facts["frame"].startswith("action: origin at the contact point")
     assert {i.name: i.doc_string for i in model.graph.input} == network_of(predictor).inputs

@@ -11,6 +11,7 @@ from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
+from foretrace.features.outline import pixel_error
 from foretrace.features.pivot_edges import NUM_VALUES, PROBES, RIM, find_pivot_edges
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
@@ -348,6 +349,28 @@ def test_the_context_changes_what_is_predicted(batch):
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(TrainingError, match=message):
         OneShotConfig(**settings).make(24)
+
+
+def test_centres_of_outlines_along_the_pixels_are_unsure():
+    """As far as those of random rectangles, rasterised, are off."""
+    rng = np.random.default_rng(0)
+    errors, expected = [], []
+    for angle in (0.0, 0.3):
+        for _ in range(60):
+            size, middle = rng.uniform(0.08, 0.16, 2), np.array([0.12, 0.0]) + rng.uniform(-1, 1, 2) * 0.002
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * size / 2 @ turn.T + middle
+            rows, columns = np.indices((VIEW_SIZE, VIEW_SIZE))
+            places = (CONTACT_PIXEL - np.stack([rows, columns], axis=-1)) * METRES_PER_PIXEL
+            mask = shapely.contains_xy(shapely.Polygon(corners), *np.moveaxis(places, -1, 0))
+            errors.append(np.linalg.norm(places[mask].mean(axis=0) - middle))
+            row = torch.from_numpy(corners).float()[[0, 1, 2, 3, *[0] * (MAX_CORNERS - 4)]]
+            expected.append(float(pixel_error(row[None])))
+    errors, expected = np.reshape(errors, (2, -1)), np.reshape(expected, (2, -1))
+    root = np.sqrt((errors**2).mean(axis=1)), np.sqrt((expected**2).mean(axis=1))
+    assert root[1][0] == pytest.approx(root[0][0], rel=0.25)
+    assert root[1][1] == 0
+    assert root[0][1] < 0.3 * root[0][0]
 
 
 def test_corners_are_read_in_their_unit(batch):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +19,19 @@ from factories import besides_doubt
 from foretrace import cli
 from foretrace.cli.futures import futures_content, prediction_band, radius_of, say_futures
 from foretrace.errors import CheckpointError
-from foretrace.imagined import LEVELS, conformal_scores
+from foretrace.imagined import LEVELS, STARTS, conformal_scores
 from foretrace.interactions.dataset import Dataset
 from foretrace.pictures.scene import Scene, legend_of, scene_figure
-from foretrace.predictor import Futures, ImaginedEffect, OneShotConfig, checkpoint, part_of, train_predictor
+from foretrace.predictor import (
+    Futures,
+    ImaginedEffect,
+    LstmConfig,
+    OneShotConfig,
+    TrainConfig,
+    checkpoint,
+    part_of,
+    train_predictor,
+)
 
 SAMPLES = 24
 CONFIG = OneShotConfig(hidden=8, components=6, outcomes=("levered", "slipped"))
@@ -229,6 +239,65 @@ def test_the_command_on_the_card_asks_for_the_same_training(card: str, run: Path
     assert config == CONFIG
     assert replace(training, min_steps=1, device="cpu", outcomes=None) == TRAINING
     assert json.loads((run / "environment.json").read_text())["versions"]["torch"] in card
+
+
+def test_recalibrated_regions_hold_on_the_new_data(card: str, run: Path, tmp_path: Path, capsys) -> None:
+    again = tmp_path / "run"
+    shutil.copytree(run, again)
+    interactions = factories.fake_interactions(np.random.default_rng(1), 240, num_samples=SAMPLES)
+    other = write_data(tmp_path / "other", interactions)
+    assert cli.main(["recalibrate", "--run", str(again), "--data", str(other)]) == 0
+    assert "start estimated" in capsys.readouterr().out
+    batch = Dataset.open(other).batch()
+    before, after = (ft.load_predictor(folder) for folder in (run, again))
+    torch.testing.assert_close(before.state_dict()["motions"], after.state_dict()["motions"])
+    same = before.imagine_batch(batch).com, after.imagine_batch(batch).com
+    np.testing.assert_allclose(*same, atol=1e-6)
+    for start in STARTS:
+        futures = after.imagine_batch(batch, start).futures
+        scores = conformal_scores(futures, batch.com, batch.length)
+        assert np.mean(scores <= futures.width(0.8)) == pytest.approx(0.8, abs=0.02)
+    text = (again / "MODEL_CARD.md").read_text()
+    assert text.startswith(card.rstrip())
+    assert "## Recalibration" in text
+    assert cli.main(["recalibrate", "--run", str(again), "--data", str(other)]) == 0
+    assert (again / "MODEL_CARD.md").read_text().count("## Recalibration") == 1
+    # The training counts as it did before.
+    assert cli.main(["train", "--data", str(other), "--out", str(again), "--predictor", "one-shot"]) == 2
+    assert "calibration" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("few", "40 interactions have an outcome that the predictor distinguishes: give at least 200"),
+        ("own", "the predictor was trained on these data"),
+        ("sampled", "the data are sampled at"),
+        ("lstm", "predictor 'lstm' has no regions to calibrate: take one-shot"),
+        ("none", "config.json"),
+    ],
+)
+def test_recalibration_refuses(
+    kind: str, message: str, run: Path, data: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    rng = np.random.default_rng(2)
+    number, samples = {"few": (40, SAMPLES), "sampled": (240, SAMPLES + 3)}.get(kind, (240, SAMPLES))
+    found = data if kind == "own" else tmp_path / "data"
+    if kind != "own":
+        write_data(found, factories.fake_interactions(rng, number, num_samples=samples))
+    folder = tmp_path / "run"
+    if kind == "lstm":
+        config = LstmConfig(features="none", hidden=4)
+        training = TrainConfig(epochs=1, min_steps=1, split=None)
+        train_predictor(Dataset.open(data), config, folder, training, progress=False)
+    elif kind != "none":
+        shutil.copytree(run, folder)
+    before = {file.name: file.read_bytes() for file in folder.glob("*.*")}
+    if kind == "own":
+        monkeypatch.setattr("foretrace.predictor.recalibration.FEWEST", 10)
+    assert cli.main(["recalibrate", "--run", str(folder), "--data", str(found)]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert {file.name: file.read_bytes() for file in folder.glob("*.*")} == before
 
 
 def test_a_card_needs_the_data_of_the_run(run: Path, tmp_path: Path, capsys) -> None:

@@ -42,6 +42,7 @@ COMMANDS: dict[str, Entry] = {
     "simulate": _command("simulation:simulate", "Simulate lever-ups of many objects into a data set.", LEARN),
     "data": _command("data:data", "Describe, check, repair or upgrade a data set.", LEARN),
     "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
+    "recalibrate": _command("training:recalibrate", "Calibrate a predictor's regions on other data.", LEARN),
     "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
     "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
     "plan": _command("planning:plan", "Choose where and how an object is levered for a goal.", LEARN),

@@ -19,7 +19,8 @@ from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import PAPER_SIZES
 from foretrace.predictor import PREDICTORS, PredictorConfig, TrainConfig
 from foretrace.predictor.config import feature_option
-from foretrace.predictor.model_card import model_card
+from foretrace.predictor.model_card import RECALIBRATED, model_card, recalibration_section
+from foretrace.predictor.recalibration import SHOWN_LEVELS
 from foretrace.predictor.run_folder import RunFolder
 
 CARD = "MODEL_CARD.md"
@@ -90,6 +91,28 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         "training": Annotated[OmitArgPrefixes[TrainConfig], arg(name="training")],
     }
     return train
+
+
+def recalibrate(run: Path, data: Path) -> None:
+    """Fit the probabilities and prediction regions of a trained predictor to data that it has not learned from.
+
+    Its motions stay the same. Data like the lever-ups that it will be used for make regions hold for these.
+
+    Args:
+        run: Folder of the training.
+        data: Folder of the data set; its predictions are tried first, with the regions as they were.
+    """
+    found = Dataset.open(data)
+    held = learned.recalibrate(run, found)
+    levels = [f"{level:.0%}" for level in SHOWN_LEVELS]
+    print(f"{'motions in regions before':28s}" + "".join(f"{level:>8s}" for level in levels))
+    for start, shares in held.items():
+        print(f"{'start ' + start:28s}" + "".join(f"{share:>8.1%}" for share in shares))
+    card = run / CARD
+    if card.is_file():
+        text = card.read_text(encoding="utf-8").partition(RECALIBRATED)[0].rstrip()
+        write_text(card, f"{text}\n\n{recalibration_section(run, data, held)}")
+    print(run)
 
 
 def feature_settings(features: type[FeatureExtractor], config_class: type[PredictorConfig]) -> type:

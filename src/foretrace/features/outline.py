@@ -84,6 +84,31 @@ def count_corners(features: Float[Tensor, "batch features"]) -> Int[Tensor, " ba
     return 1 + (corners[:, 1:] != corners[:, :1]).any(dim=2).sum(dim=1)
 
 
+def pixel_error(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, " batch"]:
+    """Expected error (root mean square) of the centres of outlines that are known from pixels [m].
+
+    A side that is parallel to the pixels' sides may lie anywhere within one of them, and moves the centre of the area by
+    its length times its distance from there, over the area. A slanted one crosses many pixels, which tell where it is.
+
+    Args:
+        corners: Corners of convex outlines in the action frame [m], counter-clockwise; the first one fills the row.
+    """
+    other = corners.roll(-1, dims=1)
+    twice = corners[..., 0] * other[..., 1] - corners[..., 1] * other[..., 0]
+    area = (twice.sum(dim=1) / 2).clamp(min=1e-6)
+    middle = (corners + other) / 2
+    # Twice the areas of triangles with the origin, and their centres.
+    centre = (twice[..., None] * middle).sum(dim=1) / (3 * area[:, None])
+    side = other - corners
+    across = side.abs().amin(dim=2) / METRES_PER_PIXEL
+    unsure = METRES_PER_PIXEL / 12**0.5 * (1 - across).clamp(min=0) ** 1.5
+    # The contact point lies on the levered side, and tells where that is.
+    levered = (corners[..., 0].abs() < METRES_PER_PIXEL) & (other[..., 0].abs() < METRES_PER_PIXEL)
+    unsure = unsure.masked_fill(levered, 0.0)
+    moved = unsure * side.norm(dim=2) * (middle - centre[:, None]).norm(dim=2) / area[:, None]
+    return moved.square().sum(dim=1).sqrt()
+
+
 def _moved_maps(
     maps: Float[Tensor, "n 1 rows columns"], axes: Float[Tensor, "n 2 2"], origins: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n rows columns"]:

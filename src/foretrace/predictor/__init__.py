@@ -6,6 +6,7 @@ from foretrace.predictor.checkpoint import load_predictor, save_checkpoint
 from foretrace.predictor.config import PredictorConfig, TrainConfig
 from foretrace.predictor.lstm import LstmConfig, LstmPredictor
 from foretrace.predictor.one_shot import OneShotConfig, OneShotPredictor
+from foretrace.predictor.recalibration import recalibrate
 from foretrace.predictor.run_folder import part_of, parts_of
 from foretrace.predictor.training import fit_predictor, train_predictor
 
@@ -26,6 +27,7 @@ __all__ = [
     "load_predictor",
     "part_of",
     "parts_of",
+    "recalibrate",
     "save_checkpoint",
     "train_predictor",
 ]

@@ -166,6 +166,14 @@ class EffectPredictor(Imaginer, nn.Module):
     ) -> None:
         """Take from training and validation part what is needed after the last step; by default nothing."""
 
+    def calibrate(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
+        """Fit probabilities and prediction regions to interactions that were not learned from; a hook.
+
+        Raises:
+            TrainingError: By default: the predictor has none.
+        """
+        raise TrainingError(f"predictor {shown(self.label)} has no regions to calibrate: take one-shot")
+
     def set_precision(self, precision: Precision) -> None:
         """Fix the number format of the large products in training; evaluation is always in float32."""
         self.features.precision = precision

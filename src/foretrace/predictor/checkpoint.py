@@ -28,6 +28,8 @@ DEFAULT = "default"
 """Folder of the predictor that comes with the package."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
+CALIBRATION = "calibration"
+"""Entry of ``config.json`` about the interactions that regions were calibrated on after the training."""
 UNBOUNDED = "quantiles"
 """Tensors in which infinity is the size of a region that holds everything; nowhere else is it a number."""
 
@@ -41,6 +43,7 @@ class PredictorEntries(TypedDict):
     outcomes: list[str]
     ranges: NotRequired[dict[str, Vector2]]
     training: NotRequired[dict[str, Any]]
+    calibration: NotRequired[dict[str, Any]]
 
 
 class OldFeatures(TypedDict):

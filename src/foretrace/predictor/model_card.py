@@ -14,8 +14,9 @@ from foretrace.imagined.domain import MEASURES, QUANTILES
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.objects import CORNER_COUNTS
 from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
-from foretrace.predictor.checkpoint import CONFIG, read_config
+from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, read_config
 from foretrace.predictor.config import feature_option
+from foretrace.predictor.recalibration import SHOWN_LEVELS
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
@@ -31,8 +32,8 @@ class Environment(TypedDict):
 
 
 PARTS = ("train", "validation", "test")
-SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
-"""Levels of the regions on the card."""
+RECALIBRATED = "## Recalibration"
+"""Heading of the section that follows a recalibration."""
 CM = 100.0
 RUNTIME_OPTIONS = ("min_steps", "device", "precision", "threads")
 """Settings of a training that the card's command leaves at their defaults."""
@@ -125,6 +126,27 @@ def _training(run: Path, data: Path) -> str:
     return (
         f"```console\n$ {' '.join(command)}\n```\n\nCommit {environment['commit'] or 'unknown'}; {versions}; on "
         f"{environment['device']} in {environment['precision']}. The data's fingerprint is `{training['data']}`."
+    )
+
+
+def recalibration_section(run: Path, data: Path, held: Mapping[str, Sequence[float]]) -> str:
+    """The section about a `recalibrate` that followed the training.
+
+    Args:
+        run: Folder of the training.
+        data: Folder of the data that the predictor was calibrated on.
+        held: As from `recalibrate`.
+    """
+    facts = read_config(run).get(CALIBRATION, {})
+    chosen = ", ".join(_settings(Dataset.open(data).manifest["configuration"]))
+    rows = [[start, *(f"{share:.1%}" for share in shares)] for start, shares in held.items()]
+    return (
+        f"{RECALIBRATED}\n\nProbabilities and regions were then fitted to {facts['interactions']} other interactions, "
+        f"which the predictor had not learned from: `foretrace recalibrate --run {run} --data {data}`. "
+        f"They were simulated with: {chosen}. The data's fingerprint is `{facts['data']}`. Shares of their motions in "
+        f"the regions as they were before, which the sections above are about:\n\n"
+        + _table(["Start", *(f"{level:.0%}" for level in SHOWN_LEVELS)], rows)
+        + "\n"
     )
 
 

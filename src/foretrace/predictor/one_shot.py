@@ -12,7 +12,7 @@ from torch import Tensor
 from foretrace.errors import TrainingError
 from foretrace.features import Outline
 from foretrace.features.base import UNIT
-from foretrace.features.outline import HEIGHT_CELLS
+from foretrace.features.outline import HEIGHT_CELLS, pixel_error
 from foretrace.features.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
 from foretrace.imagined import (
     LEVELS,
@@ -174,7 +174,8 @@ class OneShotPredictor(EffectPredictor):
         # For a start that is observed or estimated, and for a context that is told or not.
         self.register_buffer("quantiles", torch.ones(len(STARTS), 2, len(LEVELS)))
         self.register_buffer("temperature", torch.ones(2))  # of outcomes, and of edges given the outcome
-        self.register_buffer("start_error", torch.zeros(len(STARTS)))  # of centres of mass at rest [m]
+        # Of centres of mass at rest, beside that from the size of pixels [m].
+        self.register_buffer("start_error", torch.zeros(len(STARTS)))
 
     @property
     def display_name(self) -> str:
@@ -261,9 +262,9 @@ class OneShotPredictor(EffectPredictor):
             mine = residuals[effects.outcomes == outcome]
             others = other_residuals[other_effects.outcomes == outcome]
             self.covariance[outcome] = fit_covariance(mine if len(mine) else residuals, others)
-        self._calibrate(other_features, other_effects)
+        self.calibrate(other_features, other_effects)
 
-    def _calibrate(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
+    def calibrate(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
         """Fit temperatures and quantiles to a part that the networks have not learned from."""
         self.temperature.fill_(1.0)
         every = torch.ones(len(features), len(self.optional), dtype=torch.bool, device=self.device)
@@ -273,7 +274,8 @@ class OneShotPredictor(EffectPredictor):
         uniform = effects.estimated_com.isfinite().all(dim=1)
         off = (effects.estimated_com - self._com(effects.states))[uniform].square().sum(dim=1)
         if len(off):
-            self.start_error[STARTS.index("estimated")] = off.mean().sqrt()
+            own = pixel_error(self._corners(features[uniform])).square()
+            self.start_error[STARTS.index("estimated")] = (off - own).clamp(min=0).mean().sqrt()
         for told, each in enumerate(inputs):
             for start, name in enumerate(STARTS):
                 rows = uniform.nonzero()[:, 0] if name == "estimated" else torch.arange(len(effects))
@@ -286,7 +288,8 @@ class OneShotPredictor(EffectPredictor):
     ) -> Float[np.ndarray, " batch"]:
         """Conformal scores of observed motions."""
         com = self._com(effects.states) if start == "observed" else effects.estimated_com
-        futures = self._futures(self.mixture(features, com), self.quantiles[0, 0], start)
+        spread = self.start_spread(features) if start == "estimated" else None
+        futures = self._futures(self.mixture(features, com), self.quantiles[0, 0], spread)
         truth = self._metres(effects.states).double().cpu().numpy()
         return conformal_scores(futures, truth, effects.lengths.cpu().numpy())
 
@@ -319,7 +322,10 @@ class OneShotPredictor(EffectPredictor):
         """Effects with all futures, of which the most probable one is the expected one."""
         with torch.inference_mode():
             place = torch.as_tensor(com, dtype=torch.float32, device=self.device)
-            futures = self._futures(self.mixture(features, place), self._quantiles_of(features, start), start)
+            spread = self.start_spread(features) if start == "estimated" else None
+            futures = self._futures(
+                self.mixture(features, place), self._quantiles_of(features, start), spread
+            )
         if observed is not None:
             futures = futures.given(observed, float(self.times[1] - self.times[0]))
         best = futures.states[np.arange(len(com)), futures.probability.argmax(axis=1)].astype(float)
@@ -334,7 +340,7 @@ class OneShotPredictor(EffectPredictor):
     def _find_edges(
         self, features: Float[Tensor, "batch inputs"], com: Float[Tensor, "batch 3"]
     ) -> PivotEdges:
-        corners = features[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2)) * UNIT
+        corners = self._corners(features)
         heights = None
         if self.heights:
             heights = features[:, 2 * MAX_CORNERS : self.features.num_features] * UNIT
@@ -343,6 +349,15 @@ class OneShotPredictor(EffectPredictor):
         if self.config.mirrored:
             return edges
         return replace(edges, values=edges.values[:, :1], axes=edges.axes[:, :1])
+
+    @staticmethod
+    def _corners(features: Float[Tensor, "batch inputs"]) -> Float[Tensor, "batch corners 2"]:
+        return features[:, : 2 * MAX_CORNERS].unflatten(1, (-1, 2)) * UNIT
+
+    def start_spread(self, features: Float[Tensor, "batch inputs"]) -> Float[Tensor, " batch"]:
+        """Expected distances of centres of mass that were estimated from views (root mean square) [m]."""
+        own = self.start_error[STARTS.index("estimated")]
+        return (pixel_error(self._corners(features)).square() + own.square()).sqrt()
 
     def _outputs(self, features: Float[Tensor, "batch inputs"], edges: PivotEdges) -> Outputs:
         values = (edges.values - self.value_mean) / self.value_scale
@@ -402,15 +417,21 @@ class OneShotPredictor(EffectPredictor):
         some = torch.where(flags.any(dim=1)[:, None], told.maximum(nothing), nothing)
         return torch.where(flags.all(dim=1)[:, None], told, some)
 
-    def _futures(self, mixture: Mixture, quantiles: Float[Tensor, "*batch levels"], start: Start) -> Futures:
+    def _futures(
+        self,
+        mixture: Mixture,
+        quantiles: Float[Tensor, "*batch levels"],
+        start_spread: Float[Tensor, " batch"] | None,
+    ) -> Futures:
         ends = mixture.ends[:, :, None].expand(*mixture.log_probability.shape, 2, 2).flatten(1, 2)
-        own = self.start_error[STARTS.index(start)]
         spread = mixture.spread().double()
+        if start_spread is not None:
+            spread = torch.hypot(spread, start_spread.double()[:, None, None])
         return Futures(
             probability=mixture.log_probability.flatten(1).exp().double().cpu().numpy(),
             outcome=self.outcomes * self.config.pivot_edges,
             states=mixture.states().cpu().numpy(),
-            spread=(spread if start == "observed" else torch.hypot(spread, own.double())).cpu().numpy(),
+            spread=spread.cpu().numpy(),
             support_points=ends.double().cpu().numpy(),
             quantiles=quantiles.double().cpu().numpy(),
         )

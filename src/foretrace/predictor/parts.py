@@ -15,10 +15,13 @@ from foretrace.interactions.splits import Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.config import TrainConfig
 from foretrace.predictor.run_folder import Source
-from foretrace.predictor.states import valid_lengths
+from foretrace.predictor.states import Effects, valid_lengths
 
 LARGE = 20_000
 """States of a part of more interactions are kept in single precision, and features take the place of their inputs."""
+
+PIECE = 2048
+"""Rows that are normalised together."""
 
 
 @dataclass
@@ -79,6 +82,33 @@ def prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = 
         estimated_com=_estimated_com(source),
         measures=measure(source, source.com[:, 0]) | predictor.features.measure(inputs),
     )
+
+
+def features_of(part: Part, predictor: EffectPredictor) -> Tensor:
+    """Features and context of a part; computed once if the extractor is not trained with the predictor."""
+    if part.features is not None:
+        return part.features
+    fixed = not predictor.features.trainable
+    features = predictor.compute_features(part.inputs, in_place=part.large and fixed)
+    features = predictor.add_context(features, part.context)
+    if fixed:
+        part.features = features
+    return features
+
+
+def effects_of(part: Part, predictor: EffectPredictor, in_place: bool = False) -> Effects:
+    """Normalised effects of a part; in place of states in metres where there is no room for both."""
+    valid = torch.from_numpy(part.valid)
+    if in_place:
+        states = torch.from_numpy(part.states)
+        for piece, counts in zip(states.split(PIECE), valid.split(PIECE), strict=True):
+            piece.copy_(predictor.normalise(piece.numpy()).cpu() * counts[..., None])
+        states = states.to(predictor.device)
+    else:
+        states = predictor.normalise(part.states) * valid.to(predictor.device)[..., None]
+    lengths, outcomes = (torch.from_numpy(n).to(predictor.device) for n in (part.lengths, part.outcomes))
+    estimated = torch.as_tensor(part.estimated_com, dtype=torch.float32, device=predictor.device)
+    return Effects(states, lengths, outcomes, estimated)
 
 
 def _estimated_com(source: InteractionBatch) -> np.ndarray:

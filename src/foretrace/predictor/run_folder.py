@@ -36,6 +36,7 @@ from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import (
+    CALIBRATION,
     CONFIG,
     MODEL,
     RANGES,
@@ -157,7 +158,9 @@ class RunFolder:
         write_json(self.path / CONFIG, config)
 
     def _check(self, config: Mapping[str, Any]) -> None:
-        there = {name: value for name, value in read_config(self.path).items() if name != RANGES}
+        there = {
+            name: value for name, value in read_config(self.path).items() if name not in (RANGES, CALIBRATION)
+        }
         if difference := first_difference(there, config):
             name, found, wanted = difference
             raise TrainingError(

@@ -72,6 +72,7 @@ class TracedDistribution(TracedPredictor):
             "com_trajectory": "centre of mass over time in each future, in the action frame [m]",
             "rotation_vector": f"axis times angle [rad] {ROTATION}",
             "spread": "expected distance of the centre of mass from it [m]",
+            "start_spread": "that of a centre of mass at rest that is estimated from the view [m]",
             "support_points": "ends of the edge that the object turns about, in the action frame [m]",
         }
 
@@ -81,7 +82,8 @@ class TracedDistribution(TracedPredictor):
         states, outcomes = mixture.states(), mixture.log_probability.shape[2]
         ends = mixture.ends[:, :, None].expand(-1, -1, outcomes, -1, -1).flatten(1, 2)
         probability = mixture.log_probability.flatten(1).exp()
-        return probability, states[..., :3], states[..., 3:], mixture.spread(), ends
+        spreads = mixture.spread(), self.predictor.start_spread(features)
+        return probability, states[..., :3], states[..., 3:], *spreads, ends
 
     def facts(self) -> dict[str, Any]:
         """Facts that a reader of the file needs beside its inputs and outputs."""
@@ -95,9 +97,8 @@ class TracedDistribution(TracedPredictor):
             "levels": LEVELS.tolist(),
             "quantiles": quantiles,
             "floor": FLOOR,
-            "start_error": self.predictor.start_error.tolist()[-1],
             "radius": "of the tube of a level [m]: its quantile x (spread + floor); where the centre of mass was "
-            "estimated, spread is sqrt(spread^2 + start_error^2)",
+            "estimated, spread is sqrt(spread^2 + start_spread^2)",
         }
 
     def imagine(self, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -109,6 +110,7 @@ class TracedDistribution(TracedPredictor):
             "com_trajectory": futures.com,
             "rotation_vector": quaternion_to_matrix(futures.pose[..., 3:]),
             "spread": np.where(futures.counted[..., None], futures.spread, np.inf),
+            "start_spread": self.predictor.start_spread(features).numpy(),
             "support_points": futures.support_points,
         }
 

@@ -24,10 +24,19 @@ from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
 from foretrace.predictor.config import PredictorConfig, TrainConfig
 from foretrace.predictor.display import tensorboard, terminal
-from foretrace.predictor.parts import Part, check_split, choose_split, outcome_of, prepare, usable_lengths
+from foretrace.predictor.parts import (
+    Part,
+    check_split,
+    choose_split,
+    effects_of,
+    features_of,
+    outcome_of,
+    prepare,
+    usable_lengths,
+)
 from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, Source, fingerprint
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
-from foretrace.predictor.states import Effects, state_statistics
+from foretrace.predictor.states import state_statistics
 from foretrace.trajectories import final_distance, mean_distance
 
 RUNTIME = ("device", "threads", "precision")
@@ -38,7 +47,7 @@ FULL_RATE_INPUTS = 256
 FEATURE_DECAY = 1 / 800
 """Weight decay per feature."""
 PIECE = 2048
-"""Rows that are normalised or imagined together."""
+"""Rows that are imagined together."""
 IN_MEMORY = 4_000
 """A data set of more interactions is prepared piece by piece: it need not fit into memory."""
 
@@ -207,7 +216,7 @@ class _Training:
         mean, scale = state_statistics(train.states, train.valid, predictor.state)
         predictor.set_normalisation(mean, scale, train.source.times)
         predictor.set_context(train.context)
-        self.effects = self._effects_of(train, in_place=train.large)
+        self.effects = effects_of(train, predictor, in_place=train.large)
         # The loss of a state's small change is small: the usual epsilon of 1e-8 would outweigh its gradient.
         groups = parameter_groups(predictor)
         if not groups:
@@ -243,7 +252,7 @@ class _Training:
         self.predictor.load_state_dict(self.keeper.model)
         with torch.no_grad():
             features, other_features = self._features_of(self.train), self._features_of(self.validation)
-            other_effects = self._effects_of(self.validation)
+            other_effects = effects_of(self.validation, self.predictor)
             self.predictor.finish(features, self.effects, other_features, other_effects)
         self.keeper.finish(self.predictor)
         self.predictor.ranges = ranges_of(self.train.measures)
@@ -266,32 +275,8 @@ class _Training:
             self.fitted.mkdir(parents=True, exist_ok=True)
             write_tensors(file, features.state_dict())
 
-    def _effects_of(self, part: Part, in_place: bool = False) -> Effects:
-        """Normalised states; in place of those in metres where there is no room for both."""
-        predictor, valid = self.predictor, torch.from_numpy(part.valid)
-        if in_place:
-            states = torch.from_numpy(part.states)
-            for piece, counts in zip(states.split(PIECE), valid.split(PIECE), strict=True):
-                piece.copy_(predictor.normalise(piece.numpy()).cpu() * counts[..., None])
-            states = states.to(predictor.device)
-        else:
-            states = predictor.normalise(part.states) * valid.to(predictor.device)[..., None]
-        lengths, outcomes = (
-            torch.from_numpy(numbers).to(predictor.device) for numbers in (part.lengths, part.outcomes)
-        )
-        estimated = torch.as_tensor(part.estimated_com, dtype=torch.float32, device=predictor.device)
-        return Effects(states, lengths, outcomes, estimated)
-
     def _features_of(self, part: Part) -> Tensor:
-        """Features and context of a part; computed once if the extractor is not trained with the predictor."""
-        if part.features is not None:
-            return part.features
-        fixed = not self.predictor.features.trainable
-        features = self.predictor.compute_features(part.inputs, in_place=part.large and fixed)
-        features = self.predictor.add_context(features, part.context)
-        if fixed:
-            part.features = features
-        return features
+        return features_of(part, self.predictor)
 
     def _epoch(self, epoch: int) -> float:
         """One pass over the training part; the mean loss."""
