@@ -87,8 +87,9 @@ def count_corners(features: Float[Tensor, "batch features"]) -> Int[Tensor, " ba
 def pixel_error(corners: Float[Tensor, "batch corners 2"]) -> Float[Tensor, " batch"]:
     """Expected error (root mean square) of the centres of outlines that are known from pixels [m].
 
-    A side that is parallel to the pixels' sides may lie anywhere within one of them, and moves the centre of the area by
-    its length times its distance from there, over the area. A slanted one crosses many pixels, which tell where it is.
+    A side that is parallel to the pixels' sides may lie anywhere within one of them, and moves the centre of the area
+    by its length times its distance from there, over the area. A slanted one crosses many pixels, which tell where it
+    is.
 
     Args:
         corners: Corners of convex outlines in the action frame [m], counter-clockwise; the first one fills the row.
