@@ -28,11 +28,6 @@ ToolMotion = Callable[[Float[np.ndarray, " time"]], Float[np.ndarray, "time 6"]]
 FreePlay = tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]
 """Poses of the object frame, and velocities of the centre of mass and about it, table frame."""
 
-ENGINES: Registry[type["Engine"]] = Registry("engine", "foretrace.engines", SimulationError)
-"""Every engine by its name; the built-in ones are imported on first use."""
-ENGINES.declare("mujoco", "foretrace.simulation.mujoco_engine")
-ENGINES.declare("bullet", "foretrace.simulation.bullet_engine")
-
 
 class Engine(ABC):
     """Plays what a tool does to an object; it knows no action.
@@ -89,6 +84,12 @@ class Engine(ABC):
         timestep: float,
     ) -> FreePlay:
         """Plays the motion of a free body, as `simulate_free_motion` describes it."""
+
+
+ENGINES: Registry[type[Engine]] = Registry("engine", "foretrace.engines", SimulationError)
+"""Every engine by its name; the built-in ones are imported on first use."""
+ENGINES.declare("mujoco", "foretrace.simulation.mujoco_engine")
+ENGINES.declare("bullet", "foretrace.simulation.bullet_engine")
 
 
 @lru_cache(maxsize=4)
