@@ -39,6 +39,7 @@ SUMMARIES = {
     "monitoring": "The monitor on normal executions and injected faults.",
     "other-world": "Few lever-ups of another world, learned alone or over a twin.",
     "non-flat": "Masks against height maps of objects that are not flat.",
+    "planning": "Plans beside simple rules and an oracle that simulates all.",
     "uncertainty": "Calibration of probabilities, regions and samples.",
 }
 """Experiments that come with foretrace, each in a line; their modules are imported when they are looked up."""

@@ -1,0 +1,164 @@
+"""Summary, tables and picture of the experiment on plans."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from foretrace.evaluation.charts import BLUE, GREEN, ORANGE, SKY, VERMILLION, finish, grid
+from foretrace.evaluation.tables import markdown_table
+from foretrace.pictures.style import GREY, INK, new_figure, styled
+
+GOALS = ("lift", "tilt", "move", "move-to", "turn-over")
+"""What is wanted: as high as possible without a slip; 0.5 rad; as far as possible in a direction; a place 3 cm away; as
+far as possible over towards a direction."""
+SAFE = ("lift", "tilt")
+"""Goals with a limit to slips."""
+METHODS = {
+    "random": GREY,
+    "longest edge": GREY,
+    "far": GREY,
+    "closed form": ORANGE,
+    "without uncertainty": SKY,
+    "learned": BLUE,
+    "learned, checked": GREEN,
+    "twin": VERMILLION,
+    "oracle": INK,
+}
+"""Methods, with their colours."""
+WORDS = {
+    "random": "random contact (expectation)",
+    "longest edge": "middle of the longest edge",
+    "far": "farthest from the centre of mass",
+    "closed form": "closed-form rule, by the goal",
+    "without uncertainty": "planner, learned, likeliest future alone",
+    "learned": "planner, learned",
+    "learned, checked": "planner, learned, best few checked by the twin",
+    "twin": "twin of every candidate",
+    "oracle": "oracle: truth of every candidate",
+}
+DRAWS = 2000
+"""Bootstrap samples of the objects."""
+LEAST_GAP = 1e-9
+
+
+def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """By world and method, with 95 % bootstrap intervals over objects."""
+    summary: dict[str, Any] = {}
+    for world in sorted(set(rows["world"])):
+        mine = rows.loc[rows["world"].eq(world)]
+        methods = [name for name in METHODS if name in set(mine["method"])]
+        table = {
+            name: mine.pivot_table(
+                index=["family", "number"], columns=["goal", "method"], values=name, aggfunc="mean"
+            )
+            for name in ("cost", "reached", "slipped", "seconds")
+        }
+        count = len(table["cost"])
+        rng = np.random.default_rng(0)
+        drawn = np.concatenate([np.arange(count)[None], rng.integers(count, size=(DRAWS, count))])
+        found: dict[str, Any] = {}
+        for method in methods:
+            shares = {goal: _closed(table["cost"], goal, method, drawn) for goal in GOALS}
+            slips = np.mean([_mean(table["slipped"], goal, method, drawn) for goal in SAFE], axis=0)
+            success = np.mean([_mean(table["reached"], goal, method, drawn) for goal in GOALS], axis=0)
+            best = np.mean([_mean(table["reached"], goal, "oracle", drawn) for goal in GOALS], axis=0)
+            seconds = np.concatenate([np.asarray(table["seconds"][goal][method]) for goal in GOALS])
+            found[method] = {
+                "closed": _interval(np.mean(list(shares.values()), axis=0)),
+                **{f"closed {goal}": _interval(share) for goal, share in shares.items()},
+                "success": _interval(success),
+                "success, relative": _interval(success / np.maximum(best, 1e-9)),
+                "slips": _interval(slips),
+                "seconds, median": float(np.round(np.median(seconds), 4)),
+                "seconds, p95": float(np.round(np.percentile(seconds, 95), 4)),
+            }
+        summary[world] = {"objects": count, "methods": found}
+    return summary
+
+
+def _closed(costs: pd.DataFrame, goal: str, method: str, drawn: np.ndarray) -> np.ndarray:
+    """Share of the gap between random and oracle that is closed, for each sample of objects."""
+    chance, oracle, own = (np.asarray(costs[goal][name]) for name in ("random", "oracle", method))
+    gap = (chance - oracle)[drawn].sum(axis=1)
+    return (chance - own)[drawn].sum(axis=1) / np.maximum(gap, LEAST_GAP)
+
+
+def _mean(values: pd.DataFrame, goal: str, method: str, drawn: np.ndarray) -> np.ndarray:
+    return np.asarray(values[goal][method], dtype=float)[drawn].mean(axis=1)
+
+
+def _interval(samples: np.ndarray) -> dict[str, float]:
+    """The value of the objects as they are, and between which values 95 % of the samples lie."""
+    low, high = np.percentile(samples[1:], [2.5, 97.5])
+    return {
+        name: round(float(value), 4) for name, value in (("mean", samples[0]), ("low", low), ("high", high))
+    }
+
+
+def report_of(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
+    """A table for each world, and one of goals."""
+    parts = ["# Plans beside rules and an oracle"]
+    for world, found in summary.items():
+        lines, by_goal = [], []
+        for method, numbers in found["methods"].items():
+            timed = numbers["seconds, p95"] > 0
+            lines.append(
+                [
+                    WORDS[method],
+                    _percent(numbers["closed"]),
+                    _percent(numbers["success"]),
+                    _percent(numbers["success, relative"]),
+                    _percent(numbers["slips"]),
+                    f"{1000 * numbers['seconds, median']:.0f} / {1000 * numbers['seconds, p95']:.0f}"
+                    if timed
+                    else "",
+                ]
+            )
+            by_goal.append([WORDS[method], *(_percent(numbers[f"closed {goal}"]) for goal in GOALS)])
+        head = [
+            "",
+            "Gap closed",
+            "Success",
+            "Relative to oracle",
+            "Slips (lift, tilt)",
+            "Time [ms], median / p95",
+        ]
+        parts += [
+            f"## World: {world}, {found['objects']} objects",
+            markdown_table(head, lines),
+            "Share of the gap closed, by goal:",
+            markdown_table(["", *GOALS], by_goal),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _percent(numbers: Mapping[str, float]) -> str:
+    mean, low, high = (100 * numbers[name] for name in ("mean", "low", "high"))
+    return f"{mean:.1f} % [{low:.1f}, {high:.1f}]"
+
+
+@styled
+def draw(rows: pd.DataFrame) -> dict[str, Figure]:
+    """Share of the gap that is closed, method by method and world by world."""
+    summary = summary_of(rows)
+    if not summary:
+        return {}
+    fig = new_figure(9.0, 4.2)
+    axes = np.ravel(fig.subplots(1, len(summary), sharey=True, squeeze=False))
+    for ax, (world, found) in zip(axes, summary.items(), strict=True):
+        methods = [name for name in found["methods"] if name not in ("random", "oracle")]
+        for k, method in enumerate(methods):
+            numbers = found["methods"][method]["closed"]
+            mean, low, high = (100 * numbers[name] for name in ("mean", "low", "high"))
+            ax.bar(k, mean, color=METHODS[method], width=0.7)
+            ax.plot([k, k], [low, high], color=INK, linewidth=1.2)
+            ax.text(k, max(high, 0) + 2, f"{mean:.0f}", ha="center", fontsize=8.5)
+        ax.axhline(100, color=INK, linewidth=0.8, linestyle=":")
+        ax.set_xticks(range(len(methods)), [name.replace(" ", "\n", 1) for name in methods], fontsize=7.5)
+        grid(ax, title=f"{world}, {found['objects']} objects", ylim=(-30, 115))
+    axes[0].set_ylabel("gap from random to oracle closed [%]")
+    finish(fig, "Choosing a contact", "mean over five goals, 95 % bootstrap intervals over objects")
+    return {"gap": fig}
