@@ -8,6 +8,8 @@ import pytest
 import foretrace as ft
 from foretrace.cli import main
 from foretrace.errors import MonitoringError, PredictionError
+from foretrace.experiments.executions import make_execution
+from foretrace.experiments.monitor_calibration import imagine
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined import LEVELS, Futures, ImaginedEffect
 from foretrace.monitoring import Drift, MonitorCalibration
@@ -426,3 +428,50 @@ def test_recalibration_from_the_last_scores():
         drift.recalibrate(41)
     with pytest.raises(MonitoringError, match="score is -1"):
         drift.update(-1.0)
+
+
+# --- executions that nothing was fitted to ------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_faults_are_seen_and_normal_executions_hardly_ever():
+    def alarms(fault: str, number: int) -> list[ft.Verdict]:
+        execution = make_execution(402, number, fault)
+        watched = ft.Monitor(imagine(execution, "worlds"))
+        return watch(watched, execution.tracked, execution.times)
+
+    assert sum(alarms("", number)[-1].alarm for number in range(6)) <= 1
+    pushed = [alarms("pushed", number) for number in range(3)]
+    assert all(each[-1].alarm for each in pushed)
+    frozen = alarms("freeze", 0)
+    assert frozen[-1].cause == FROZEN
+    assert frozen[-1].rest is None or frozen[-1].rest.times[0] > frozen[-1].time
+    slipped = next(each for each in (alarms("slip", number) for number in range(4)) if each[-1].alarm)
+    first = next(each for each in slipped if each.alarm)
+    assert first.rest is not None
+    assert first.rest.com_trajectory[-1, 2] < 0.02  # back on the table
+
+
+def test_executions_are_decided_by_their_seed_and_differ_by_their_fault():
+    one, again, fault = make_execution(403, 0), make_execution(403, 0), make_execution(403, 0, "jump")
+    np.testing.assert_array_equal(one.poses, again.poses)
+    assert one.deviation.max() == 0
+    assert [each is None for each in one.tracked] == [each is None for each in again.tracked]
+    assert 0.004 < fault.deviation[-1] < 0.03
+    np.testing.assert_array_equal(fault.poses, fault.normal)
+
+
+@pytest.mark.slow
+def test_plans_average_over_beliefs():
+    config = ft.PlanConfig(spacing=0.05, directions=1, refine=0, check=0)
+    plan = ft.plan(PRISM, ft.goals.Lift(), context=ft.Belief(worlds=4), config=config)
+    assert plan.imagined.com_trajectory[-1, 2] > 0.02
+    assert ft.Monitor(plan).imagined is plan.imagined
+
+
+def test_the_calibration_that_comes_along():
+    worlds, futures = (MonitorCalibration.shipped(kind) for kind in ("worlds", "futures"))
+    assert worlds.executions >= 100
+    assert 1 < worlds.threshold(0.05) < futures.threshold(0.05)
+    with pytest.raises(MonitoringError, match="choose from worlds, futures"):
+        MonitorCalibration.shipped("plans")

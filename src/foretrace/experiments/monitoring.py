@@ -31,6 +31,7 @@ from foretrace.experiments.monitoring_tables import (
     auroc,
     columns,
     confusion,
+    drift_after,
     is_wrong,
     percent,
     pick,
@@ -38,7 +39,7 @@ from foretrace.experiments.monitoring_tables import (
 )
 from foretrace.files import short_hash
 from foretrace.imagined import ImaginedEffect, conformal_scores
-from foretrace.monitoring import Monitor, Verdict
+from foretrace.monitoring import Monitor, MonitorCalibration, Verdict
 from foretrace.monitoring.calibration import SHIPPED
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor.checkpoint import default_checkpoint
@@ -141,6 +142,7 @@ class Monitoring(Experiment):
         summary["faults"] = {fault: about_faults(pick(table, mine)) for fault, mine in of.items()}
         summary["all_faults"] = about_faults(pick(table, wrong)) if wrong.any() else {}
         summary["rest"] = about_rests(pick(table, normal))
+        summary["drift"] = drift_after(table, MonitorCalibration.shipped("worlds"))
         summary["update_ms"] = float(np.median(table["update_ms"]))
         summary["transitions"] = float(table["transition"][normal].mean())
         return summary
@@ -208,6 +210,12 @@ class Monitoring(Experiment):
         ]
         parts.append(markdown_table(head, lines))
         parts.append(confusion(columns(rows)))
+        if drift := summary["drift"]:
+            parts.append(
+                f"Drift, after frictions of all executions are doubled or halved: seen after {drift['median']:.0f} "
+                f"executions (median; 95 %: {drift['p95']:.0f}); before, in {100 * drift['before']:.1f} % of 50 normal "
+                "executions in a row."
+            )
         parts.append(f"One update: {summary['update_ms']:.2f} ms of processor time (median).")
         return "\n\n".join(parts) + "\n"
 

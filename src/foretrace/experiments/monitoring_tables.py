@@ -8,9 +8,12 @@ import pandas as pd
 
 from foretrace.evaluation.tables import markdown_table
 from foretrace.experiments.executions import CAUSES, FAULTS, MOVED
+from foretrace.monitoring import Drift, MonitorCalibration
 
 CM = 100.0
 NORMAL, CALIBRATION = "normal", "calibration"
+BEFORE, LONGEST, ORDERS = 50, 200, 200
+"""Normal executions before a drift, most executions after it, and random orders of them."""
 PROBES = tuple(range(4, 59, 6))
 """Samples at which distances are kept, for quantiles that hold for each of them."""
 Table = Mapping[str, np.ndarray]
@@ -93,6 +96,30 @@ def about_rests(table: Table) -> dict[str, Any]:
                 "slip": float(mine["ten_slip"].mean()),
             }
     return found
+
+
+def drift_after(table: Table, calibration: MonitorCalibration) -> dict[str, float]:
+    """Executions with other frictions until a drift is seen, after normal ones; in random orders.
+
+    Args:
+        table: Columns of the rows.
+        calibration: The calibration in question.
+    """
+    normal, other = (table["score"][table["part"] == part] for part in (NORMAL, "friction"))
+    if len(normal) < BEFORE or not len(other):
+        return {}
+    rng, late, early = np.random.default_rng(0), [], 0
+    for seed in range(ORDERS):
+        drift = Drift(calibration, seed=seed)
+        early += any([drift.update(float(score)) for score in rng.choice(normal, BEFORE, replace=False)])
+        if not drift.drifted:
+            after = rng.choice(other, LONGEST)
+            late.append(next((k for k, score in enumerate(after, 1) if drift.update(float(score))), LONGEST))
+    return {
+        "before": early / ORDERS,
+        "median": float(np.median(late)),
+        "p95": float(np.quantile(late, 0.95)),
+    }
 
 
 def confusion(table: Table) -> str:

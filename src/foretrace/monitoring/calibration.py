@@ -62,6 +62,18 @@ class MonitorCalibration:
         left = np.full(len(LEVELS), np.nan) if rest is None else quantiles_of(np.asarray(rest, dtype=float))
         return cls(len(found), quantiles_of(found), left, about)
 
+    @classmethod
+    def shipped(cls, kind: str) -> "MonitorCalibration":
+        """The one that comes with foretrace, for effects imagined with a belief (``worlds``) or without (``futures``).
+
+        Raises:
+            MonitoringError: There is no such kind.
+        """
+        kinds = shipped()["kinds"]
+        if kind not in kinds:
+            raise MonitoringError(f"kind {shown(kind)} is unknown: choose from {', '.join(kinds)}")
+        return cls.of_entries(kinds[kind], SHIPPED.name)
+
     def threshold(self, false_alarms: float) -> float:
         """Score above which there is an alarm.
 
@@ -153,8 +165,4 @@ def check_calibration(calibration: Any, kind: str) -> MonitorCalibration:
     if isinstance(calibration, str | Path):
         return MonitorCalibration.load(calibration)
     check_type("calibration", calibration, (MonitorCalibration, type(None)), MonitoringError)
-    return (
-        MonitorCalibration.of_entries(shipped()["kinds"][kind], SHIPPED.name)
-        if calibration is None
-        else calibration
-    )
+    return MonitorCalibration.shipped(kind) if calibration is None else calibration

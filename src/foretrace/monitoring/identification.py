@@ -28,8 +28,10 @@ TEMPERS = (0.1, 0.4, 1.0)
 """Shares of the likelihood after each round: each round's worlds are drawn where those before it fit."""
 JITTER = 0.25
 """Distance that particles are moved by between rounds, in standard deviations."""
-BEST = 24
+BEST = 48
 """Worlds of the last round that a second, exact imaginer plays again."""
+LEAST = 12
+"""Worlds that count then, at least: the likelihood is tempered until they do, as so few cannot tell more."""
 WIDTH = 1.5e-3
 """Width of the likelihood: error of the learned imaginer [m]. That of the exact one is half as wide."""
 SPEED_TIME = 0.02
@@ -108,7 +110,7 @@ def identify(
         few = _resampled(weights, BEST, rng)
         values, worlds = values[few], {name: each[few] for name, each in worlds.items()}
         again = play_worlds(exact, view, action, com, worlds, parameters)
-        weights = _normalised(log_likelihood(again, motion, WIDTH / 2) - likelihood[few])
+        weights = _tempered(log_likelihood(again, motion, WIDTH / 2) - likelihood[few])
     return belief.updated(values, weights)
 
 
@@ -143,6 +145,10 @@ def log_likelihood(
     duration = np.minimum(np.diff(times, prepend=times[0]), LONGEST_STEP)
     moving = np.linalg.norm(np.concatenate([moved[0], turned], axis=1), axis=1) > MOVING
     counts = RATE * duration * np.maximum.accumulate(moving)
+    if (
+        total := counts.sum()
+    ) > 0:  # where no world fits within the width, it is as wide as the best one is off
+        square = square / max(1.0, float((square * counts).sum(axis=1).min() / total))
     log = -0.5 * (TAIL + 1) * (np.log1p(square / TAIL) * counts).sum(axis=1)
     found = np.full(futures.probability.shape, -np.inf)
     found[world, slot] = log + np.log(futures.probability[world, slot])
@@ -176,6 +182,15 @@ def _resampled(
     """Rows drawn evenly along the cumulative weights."""
     places = (np.arange(count) + rng.random()) / count
     return np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+
+
+def _tempered(log: Float[np.ndarray, " worlds"]) -> Float[np.ndarray, " worlds"]:
+    """Normalised weights, of the largest power up to 1 by which an effective number of `LEAST` worlds counts."""
+    for power in 0.8 ** np.arange(60):
+        weights = _normalised(power * log)
+        if 1 / np.sum(weights**2) >= min(LEAST, len(log)):
+            return weights
+    return np.full(len(log), 1 / len(log))
 
 
 def _normalised(log: Float[np.ndarray, " worlds"]) -> Float[np.ndarray, " worlds"]:

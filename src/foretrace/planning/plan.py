@@ -11,7 +11,7 @@ from jaxtyping import Float
 from foretrace.actions import LeverUp
 from foretrace.errors import PlanningError, check_choices, check_ranges, check_type, is_whole, shown
 from foretrace.geometry import Numbers, finite_array
-from foretrace.imagined import IMAGINERS, Imaginer
+from foretrace.imagined import IMAGINERS, Belief, Imaginer
 from foretrace.imagined.context import Context
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
@@ -70,7 +70,7 @@ def plan(
     seen: ObjectModel | TopDownView,
     goal: Goal | Callable[..., Any],
     imaginer: Imaginer | None = None,
-    context: Context = None,
+    context: Context | Belief = None,
     *,
     checker: Imaginer | None = None,
     config: PlanConfig = PlanConfig(),

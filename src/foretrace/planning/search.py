@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import PlanningError
-from foretrace.imagined import Imaginer
+from foretrace.imagined import Belief, Imaginer
 from foretrace.imagined.context import Context
 from foretrace.planning.candidates import Candidates, Rim, Scene, find_free, place
 from foretrace.planning.goals import Goal, describe
@@ -57,7 +57,7 @@ class Search:
     goal: Goal
     imaginer: Imaginer
     checker: Imaginer | None
-    context: Context
+    context: Context | Belief
     config: "PlanConfig"
     reach: Callable[[LeverUp], str | None] | None = None
     rim: Rim = field(init=False)
