@@ -43,7 +43,7 @@ def main() -> None:
         fig.supxlabel("time [s]", fontsize=10)
         fig.supylabel("score, widths of the band", fontsize=10)
         fig.savefig(HERE / "causes.png", dpi=110)
-        fig = Figure(figsize=(9, 3.4), layout="constrained")
+        fig = Figure(figsize=(9, 2.6), layout="constrained")
         draw_beliefs(list(fig.subplots(1, 4)))
         fig.savefig(HERE / "belief.png", dpi=110)
 

@@ -34,6 +34,7 @@ from foretrace.monitoring import identify
 from foretrace.objects import Prism, Weighted, sample_prism
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.twin import TwinConfig, TwinImaginer
 
 LEARNED_FROM, TRIED = 3, 3
 """Lever-ups of each object that are learned from, and others that are imagined."""
@@ -61,6 +62,8 @@ class Identification(Experiment):
     """Number of objects."""
     seed: int = 301
     """Seed of objects and worlds."""
+    exact: bool = False
+    """Whether the twin plays the best worlds again."""
 
     label = "identification"
     summary = SUMMARIES["identification"]
@@ -75,7 +78,8 @@ class Identification(Experiment):
     def identity(self) -> dict[str, Any] | None:
         """The predictor and the seed."""
         config = (default_checkpoint() / "config.json").read_bytes()
-        return {"predictor": short_hash([config]), "seed": self.seed}
+        own = {"predictor": short_hash([config]), "seed": self.seed}
+        return own | {"exact": True} if self.exact else own
 
     def run(self, trial: IdentificationTrial, folder: Path) -> Sequence[Row]:
         """Errors of the centre of mass, ranks of the true constants, errors of other lever-ups."""
@@ -84,13 +88,20 @@ class Identification(Experiment):
         rows: list[Row] = []
         belief: Belief | None = None
         begin = time.process_time()
+        twin = TwinImaginer(config=TwinConfig(workers=1)) if self.exact else None
         for k, action in enumerate(case.actions[:LEARNED_FROM]):
             poses = case.play(action, rng)
             tracked = track(poses, PERIOD * np.arange(len(poses)), "", rng)
             seen = np.array([j for j, pose in enumerate(tracked) if pose is not None])
             motion = ObservedMotion(PERIOD * seen, np.array([tracked[j] for j in seen]))
             belief = identify(
-                TopDownView.of(case.prism, action), action, motion, belief, imaginer=predictor(), seed=k
+                TopDownView.of(case.prism, action),
+                action,
+                motion,
+                belief,
+                imaginer=predictor(),
+                exact=twin,
+                seed=k,
             )
             if k + 1 in SHOWN:
                 rows += _about(belief, case, k + 1)
