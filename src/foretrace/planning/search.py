@@ -31,6 +31,8 @@ MODES = 6
 """Places of the outline around which candidates are drawn."""
 APART = 0.006
 """Contacts nearer than this along the outline are the same place [m]."""
+CROWDED = 0.02
+"""The same where candidates were drawn around the best, which would otherwise all be checked at one place [m]."""
 DIFFERENT = 0.015
 """An alternative is further than this from the contacts of better ones [m]."""
 ALTERNATIVES = 5
@@ -246,10 +248,11 @@ class Search:
         """
         wanted = max(1, self.config.check)
         order = self._order(pool, scores)
+        apart = CROWDED if self.config.refine else APART
         if self.reach is None:
-            return self._distinct(pool, order, wanted)
+            return self._distinct(pool, order, wanted, apart)
         kept, first = [], ""
-        for row in self._distinct(pool, order, TRIED).tolist():
+        for row in self._distinct(pool, order, TRIED, apart).tolist():
             reason = self.reach(pool.actions[row])
             if reason is None:
                 kept.append(row)
