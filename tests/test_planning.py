@@ -433,6 +433,7 @@ def test_plan_of_a_view_is_opened_without_an_object(tmp_path):
         ({"action": {"label": "lever-up"}}, "cannot be read"),
         ({"futures": None}, "entry futures"),
         ({"times": [0.0]}, "shape"),
+        ({"rim": {"points": [[0.0, 0.0]], "cost": [1.0, 2.0], "risk": [0.0]}}, "rim.cost has the shape"),
     ],
 )
 def test_damaged_plan_is_refused_in_one_line(tmp_path, change, message):
@@ -504,6 +505,7 @@ for call in (
     lambda: ft.plan(box, goals.Lift(), reach=3),
     lambda: ft.plan(box, goals.Lift(), T_table_object=[1, 2]),
     lambda: goals.Lift(max_slip="no"),
+    lambda: goals.KeepUpright(chance=None),
     lambda: goals.TurnOver(edge=1.5),
     lambda: goals.Avoid([(0, 0), (1, 0), (0, 1)], level="high"),
     lambda: ft.PlanConfig(criterion="best"),
@@ -523,6 +525,7 @@ config of type int: give PlanConfig
 reach is 3: give a function of a lever-up, or None
 T_table_object must be numbers in the shape (4, 4), not in the shape (2,)
 max_slip is 'no': give a probability, 0 to 1
+chance is None: give a probability, 0 to 1
 edge is 1.5: give the number of an edge, from 0 on
 level 'high' of a region: choose one from 0.01 to 0.99
 criterion is 'best': choose from expected, cvar, likeliest

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from msgspec import Meta
 
-from foretrace.errors import PerceptionError, is_number, shown
+from foretrace.errors import PerceptionError, fault, is_number, shown
 from foretrace.files import read_json, write_json
 from foretrace.geometry import transform_points
 from foretrace.interactions.camera_yaml import read_camera_yaml
@@ -89,9 +89,16 @@ class PinholeCamera:
                     "check the order of the values"
                 )
         sizes = (FISHEYE_SIZE,) if self.fisheye else DISTORTION_SIZES
-        if len(self.distortion) not in sizes or not np.isfinite(self.distortion).all():
-            lens = "a fisheye lens has 4" if self.fisheye else "give 0, 4, 5, 8, 12 or 14"
-            raise PerceptionError(f"camera: distortion {list(self.distortion)}: {lens} finite coefficients")
+        lens = "a fisheye lens has 4" if self.fisheye else "give 0, 4, 5, 8, 12 or 14"
+        try:
+            values = np.asarray(self.distortion, dtype=float)
+        except (TypeError, ValueError):
+            values = np.full((), np.nan)
+        if values.ndim != 1 or len(values) not in sizes or not np.isfinite(values).all():
+            given = values.tolist() if values.ndim == 1 else shown(self.distortion)
+            raise fault(PerceptionError, values.ndim == 1)(
+                f"camera: distortion {given}: {lens} finite coefficients"
+            )
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:

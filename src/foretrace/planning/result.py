@@ -315,7 +315,7 @@ def _from_content(content: _Plan) -> Plan:
         alternatives=tuple(
             Alternative(**{**each, "action": _lever_up(each["action"])}) for each in content["alternatives"]
         ),
-        rim=RimCost(**{name: _array(name, values, None) for name, values in content["rim"].items()}),
+        rim=_rim(content["rim"]),
         stages=tuple(Stage(**{**each, "contact": np.array(each["contact"])}) for each in content["stages"]),
         outline=_array("outline", content["outline"], (len(content["outline"]), 2)),
         object=None if obj is None else object_from_dict(obj),
@@ -331,6 +331,15 @@ def _from_content(content: _Plan) -> Plan:
     )
 
 
+def _rim(content: _Rim) -> RimCost:
+    count = len(content["points"])
+    return RimCost(
+        _array("rim.points", content["points"], (count, 2)),
+        _array("rim.cost", content["cost"], (count,)),
+        _array("rim.risk", content["risk"], (count,)),
+    )
+
+
 def _lever_up(content: Mapping[str, Any]) -> LeverUp:
     action = Action.from_dict(content)
     if not isinstance(action, LeverUp):
@@ -338,10 +347,10 @@ def _lever_up(content: Mapping[str, Any]) -> LeverUp:
     return action
 
 
-def _array(name: str, values: Any, shape: tuple[int, ...] | None) -> np.ndarray:
+def _array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Numbers; null is NaN."""
     array = np.array(values, dtype=float)
-    if shape is not None and array.shape != shape:
+    if array.shape != shape:
         raise ValueError(f"entry {name} has the shape {array.shape}, {shape} is expected")
     return array
 

@@ -213,13 +213,13 @@ def no_slip(most: float | None) -> tuple[Constraint, ...]:
     return (Constraint("slip", most, lambda motions: motions.is_outcome(SLIPPED), (SLIPPED,)),)
 
 
-def check_probability(name: str, value: Any) -> None:
-    """Refuse what is neither None nor a probability.
+def check_probability(name: str, value: Any, optional: bool = False) -> None:
+    """Refuse what is no probability; None is one where it is optional.
 
     Raises:
         PlanningError: Naming it.
     """
-    if value is not None and not (is_number(value) and 0 <= value <= 1):
+    if not (is_number(value) and 0 <= value <= 1) and not (optional and value is None):
         raise fault(PlanningError, is_number(value))(f"{name} is {shown(value)}: give a probability, 0 to 1")
 
 

@@ -37,7 +37,7 @@ class Lift(Goal):
     """Rise from which on the goal counts as reached [m]."""
 
     def __post_init__(self) -> None:
-        check_probability("max_slip", self.max_slip)
+        check_probability("max_slip", self.max_slip, optional=True)
         check_length("at_least", self.at_least)
 
     def cost(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
@@ -69,7 +69,7 @@ class Tilt(Goal):
     def __post_init__(self) -> None:
         check_angle("angle", self.angle, 0.0, np.pi)
         check_angle("tolerance", self.tolerance, 0.0, np.pi)
-        check_probability("max_slip", self.max_slip)
+        check_probability("max_slip", self.max_slip, optional=True)
 
     def _off(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
         tilt = np.where(motions.is_outcome(LEVERED), motions.at_end(motions.tilt), 0.0)

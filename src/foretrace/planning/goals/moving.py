@@ -46,7 +46,7 @@ class Move(Goal):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", unit("direction", self.direction))
-        check_probability("max_slip", self.max_slip)
+        check_probability("max_slip", self.max_slip, optional=True)
         check_length("at_least", self.at_least)
 
     def _way(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
