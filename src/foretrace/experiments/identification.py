@@ -60,7 +60,7 @@ class Identification(Experiment):
 
     objects: int = 24
     """Number of objects."""
-    seed: int = 301
+    seed: int = 911
     """Seed of objects and worlds."""
     exact: bool = False
     """Whether the twin plays the best worlds again."""
