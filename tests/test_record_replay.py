@@ -12,6 +12,7 @@ import factories
 from engines_at_hand import WITHOUT_BULLET
 from foretrace import replay
 from foretrace.actions import Action, LeverUp, Screwdriver, ToolPath
+from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import ActionError, SimulationError
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
@@ -19,7 +20,7 @@ from foretrace.interactions.record import ExecutionOffset, Interaction, Physics
 from foretrace.objects import MeshObject, Prism
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.randomisation import RANDOMISED, VARIED_ACTION
+from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.recipes import RECIPES
 
 TOOL = SimulationConfig(embodiment="tool")

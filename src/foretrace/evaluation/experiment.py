@@ -35,7 +35,7 @@ SUMMARIES = {
     "transfer": "Predictions against recordings, or a stand-in for the robot.",
     "twin": "The twin, which simulates what it sees, and what is learned.",
     "shipped": "The predictor of the package on lever-ups that are new to it.",
-    "identification": "What lever-ups of an object tell of friction and centre of mass.",
+    "identification": "What a few lever-ups tell of an object and the table.",
     "monitoring": "The monitor on normal executions and injected faults.",
     "other-world": "Few lever-ups of another world, learned alone or over a twin.",
     "non-flat": "Masks against height maps of objects that are not flat.",
