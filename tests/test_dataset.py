@@ -238,6 +238,14 @@ def test_opening_nothing_names_the_folder_and_the_remedy(tmp_path):
         Dataset.open(tmp_path)
 
 
+def test_a_manifest_does_not_tell_which_shard_was_finished_first(folder):
+    before = (folder / "manifest.json").read_bytes()
+    manifest = storage.read_manifest(folder)
+    assert len(manifest["shards"]) > 1
+    storage.write_manifest(folder, manifest | {"shards": dict(reversed(manifest["shards"].items()))})
+    assert (folder / "manifest.json").read_bytes() == before
+
+
 def test_opening_another_version_or_a_damaged_manifest(folder):
     path = folder / storage.MANIFEST
     manifest = json.loads(path.read_text())

@@ -341,8 +341,9 @@ def new_manifest(
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Replace the manifest, atomically."""
-    write_json(folder / MANIFEST, manifest)
+    """Replace the manifest, atomically; shards in the order of their names, whichever was finished first."""
+    shards = dict(sorted(manifest["shards"].items()))
+    write_json(folder / MANIFEST, {**manifest, "shards": shards})
 
 
 def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
