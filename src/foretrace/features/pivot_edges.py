@@ -17,6 +17,7 @@ from foretrace.features.base import UNIT, FeatureExtractor
 from foretrace.features.outline import Outline
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import polygon_centroid
+from foretrace.interactions.batch import MIRROR
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.hull import MAX_CORNERS, mask_contour
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
@@ -36,8 +37,6 @@ NUM_VALUES = 27
 """Numbers that describe a lever-up relative to one edge."""
 PROBES = 5
 """Places along either side of the rectangle about the hull at which heights are read."""
-MIRROR = (1.0, -1.0, 1.0)
-"""A vector seen in a mirror along the action axis."""
 IN_MIRROR = [0, 1, 2, 4, 3, 5, 7, 6, 8, 9, 11, 10, 13, 12, 15, 14, 16, 17, 19, 18, 21, 20, 23, 22, 25, 24, 26]
 """Index that each of the numbers has in the mirror image, which may change its sign."""
 SIGN_IN_MIRROR = torch.ones(NUM_VALUES)

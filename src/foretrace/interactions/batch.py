@@ -20,7 +20,7 @@ from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, Weighted
 
-IN_MIRROR = np.array([1.0, -1.0, 1.0])
+MIRROR = np.array([1.0, -1.0, 1.0])
 """Factors of a vector's coordinates in a mirror along the action axis."""
 
 
@@ -100,10 +100,10 @@ class InteractionBatch:
             self,
             mask=np.ascontiguousarray(self.mask[:, :, ::-1]),
             height=np.ascontiguousarray(self.height[:, :, ::-1]),
-            corners=np.take_along_axis(self.corners, order[..., None], axis=1) * IN_MIRROR[:2],
-            com=self.com * IN_MIRROR,
-            pose=self.pose * [*IN_MIRROR, 1, -1, 1, -1],
-            support_points=np.ascontiguousarray(self.support_points[:, ::-1] * IN_MIRROR[:2]),
+            corners=np.take_along_axis(self.corners, order[..., None], axis=1) * MIRROR[:2],
+            com=self.com * MIRROR,
+            pose=self.pose * [*MIRROR, 1, -1, 1, -1],
+            support_points=np.ascontiguousarray(self.support_points[:, ::-1] * MIRROR[:2]),
         )
 
     @classmethod

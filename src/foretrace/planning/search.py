@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import PlanningError
-from foretrace.imagined import Belief, Imaginer
+from foretrace.imagined import Belief, ImaginedBatch, ImaginedEffect, Imaginer
 from foretrace.imagined.context import Context
 from foretrace.planning.candidates import Candidates, Rim, Scene, find_free, place
 from foretrace.planning.goals import Goal, describe
@@ -87,13 +87,9 @@ class Search:
             pool, scores = self._refine(pool, scores)
         rows = self._shortlist(pool, scores)
         if self.checker is not None and self.checker.name != self.imaginer.name:
-            scores, batch, rows = self._check(pool, scores, rows)
-            imagined = batch[0]
+            scores, imagined, rows = self._check(pool, scores, rows)
         else:
-            actions = self.scene.in_view([pool.actions[rows[0]]])
-            imagined = self.imaginer.imagine_candidates(
-                self.scene.view, actions, context=self.context, com=self.scene.com_in_view
-            )[0]
+            imagined = self._imagine(self.imaginer, pool[rows[:1]])[0]
         best = int(rows[0])
         one = scores[[best]]
         return Plan(
@@ -159,8 +155,8 @@ class Search:
 
     def _check(
         self, pool: Candidates, scores: Scores, rows: Int[np.ndarray, " k"]
-    ) -> tuple[Scores, "list", Int[np.ndarray, " k"]]:
-        """Scores with the checked ones blended in, what the checker imagined, and the checked rows, best first."""
+    ) -> tuple[Scores, ImaginedEffect, Int[np.ndarray, " k"]]:
+        """Scores with the checked ones blended in, what is imagined of the best, and the checked rows, best first."""
         assert self.checker is not None
         started, chosen = perf_counter(), pool[rows]
         batch = self._imagine(self.checker, chosen)
@@ -174,9 +170,9 @@ class Search:
         for name in names:
             merged[name][rows] = getattr(blended, name)
         self._tell("checked", chosen, blended, started, float(blended.cost[0]), order)
-        return replace(scores, **merged), [batch[int(order[0])]], rows[order]
+        return replace(scores, **merged), batch[int(order[0])], rows[order]
 
-    def _imagine(self, imaginer: Imaginer, candidates: Candidates):
+    def _imagine(self, imaginer: Imaginer, candidates: Candidates) -> ImaginedBatch:
         return imaginer.imagine_candidates(
             self.scene.view,
             self.scene.in_view(candidates.actions),
@@ -322,7 +318,6 @@ class Search:
     def _reasons(self, scores: Scores, total: int) -> dict[str, int]:
         """How many candidates were not chosen for which reason."""
         reasons = dict(self.lost)
-        broken = 0
         for column, name in enumerate(scores.names):
             over = int((scores.chances[:, column] > scores.limits[column]).sum())
             if over:
