@@ -95,7 +95,7 @@ def test_an_imagined_lever_up_needs_no_truth(interaction, tmp_path):
     scene = Scene.imagined(interaction.object, interaction.action, times, {"im-cnn": com})
     np.testing.assert_allclose(scene.pose, np.tile(interaction.effect.pose_trajectory[0], (60, 1)), atol=1e-9)
     shown = texts(scene_figure(scene))
-    assert "Imagined lever-up, 7 corners" in shown
+    assert "Predicted path of a lever-up; object at rest, 7 corners" in shown
     assert "centre of mass, im-cnn" in shown
     few = Scene.imagined(interaction.object, interaction.action, times[:2], {"im-cnn": com})
     assert animation.scene_animation(few, tmp_path / "imagined.gif").exists()

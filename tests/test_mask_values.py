@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from foretrace.cli.prediction import ObjectOptions
+from foretrace.cli.objects import ObjectOptions
 from foretrace.errors import ForetraceError, ShapeError
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Prism, read_silhouette

@@ -7,8 +7,8 @@ import numpy as np
 from foretrace.cli.console import say
 
 if TYPE_CHECKING:
+    from foretrace.imagined import Futures, ImaginedEffect
     from foretrace.pictures.bands import PredictionBand
-    from foretrace.predictor import Futures, ImaginedEffect
 
 LEVEL = 0.9
 """Probability of the region that is told of."""
@@ -18,6 +18,8 @@ SUREST = 0.995
 """Probabilities beyond are not told more exactly: they were fitted to a few thousand lever-ups."""
 LEAST_PROBABLE = 0.01
 """Futures less probable than this are not drawn."""
+LEAST_MOVING = 0.05
+"""The object is not shown moving in futures less probable than this."""
 
 
 def prediction_band(imagined: "ImaginedEffect") -> "PredictionBand":
@@ -36,6 +38,22 @@ def prediction_band(imagined: "ImaginedEffect") -> "PredictionBand":
         LEVEL,
         [(f"{futures.outcome[k]} {futures.probability[0, k]:.0%}", futures.com[0, k]) for k in others],
     )
+
+
+def other_motions(imagined: "ImaginedEffect", T_action_object: np.ndarray) -> list[np.ndarray]:
+    """Poses of the object's frame (time, 7) in the futures beside the most probable one, which are probable enough.
+
+    Args:
+        imagined: What is predicted.
+        T_action_object: Object frame -> action frame at rest.
+    """
+    from foretrace.imagined.futures import carried_poses
+
+    futures = imagined.futures
+    if futures.is_point:
+        return []
+    others = [k for k in _in_order(futures)[1:] if futures.probability[0, k] >= LEAST_MOVING]
+    return [carried_poses(futures.pose[0, k], T_action_object) for k in others]
 
 
 def _in_order(futures: "Futures") -> list[int]:

@@ -8,8 +8,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
 from foretrace.cli.futures import radius_of
+from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
-from foretrace.cli.prediction import ObjectOptions, PhotoOptions
 from foretrace.errors import PlanningError
 from foretrace.perception.photo import PhotoConfig
 from foretrace.planning import PlanConfig, goals

@@ -9,7 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import PredictionError
-from foretrace.geometry import rotation_vector_to_quaternion
+from foretrace.geometry import (
+    matrix_to_pose,
+    quaternion_to_matrix,
+    rotation_vector_to_quaternion,
+)
 from foretrace.imagined.context import CONSTANTS, nominal_constants
 from foretrace.interactions.record import Outcome
 
@@ -210,6 +214,22 @@ def quantiles_of(scores: Float[np.ndarray, " n"]) -> Float[np.ndarray, " levels"
     return ordered[np.minimum(np.ceil(LEVELS * len(ordered)).astype(int) - 1, len(scores))]
 
 
+def carried_poses(
+    moved: Float[np.ndarray, "time 7"], T_action_object: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "time 7"]:
+    """Poses of an object's frame in the action frame, from its centre of mass and its rotation since rest.
+
+    Args:
+        moved: As ``ImaginedEffect.pose_trajectory``.
+        T_action_object: Object frame -> action frame at rest.
+    """
+    turns = quaternion_to_matrix(moved[:, 3:])
+    poses = np.tile(T_action_object, (len(moved), 1, 1))
+    poses[:, :3, :3] = turns @ T_action_object[:3, :3]
+    poses[:, :3, 3] = moved[:, :3] + turns @ (T_action_object[:3, 3] - moved[0, :3])
+    return matrix_to_pose(poses)
+
+
 @dataclass(frozen=True)
 class ImaginedEffect:
     """The effect that an imaginer expects of one action."""
@@ -229,6 +249,33 @@ class ImaginedEffect:
     """What the imaginer was told beside the view, by name [SI]; NaN: not told."""
     worlds: "Worlds | None" = None
     """Motions in all worlds of a `Belief` that was averaged over; None: there was none."""
+
+    def object_poses(self, T_action_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "time 7"] | None:
+        """Poses of the object's frame in the action frame over time: position [m], quaternion (w, x, y, z).
+
+        Args:
+            T_action_object: Object frame -> action frame at rest.
+
+        Returns:
+            One pose for each of ``times``; None if only positions are predicted.
+        """
+        return None if self.pose_trajectory is None else carried_poses(self.pose_trajectory, T_action_object)
+
+    def until(self, end: float) -> "ImaginedEffect":
+        """The same up to a time [s], without the worlds of a belief; its probabilities are those of the whole."""
+        kept = self.times <= end + 1e-9
+        futures = replace(
+            self.futures, states=self.futures.states[:, :, kept], spread=self.futures.spread[:, :, kept]
+        )
+        pose = None if self.pose_trajectory is None else self.pose_trajectory[kept]
+        return replace(
+            self,
+            times=self.times[kept],
+            com_trajectory=self.com_trajectory[kept],
+            pose_trajectory=pose,
+            futures=futures,
+            worlds=None,
+        )
 
     def __repr__(self) -> str:
         chances = ", ".join(

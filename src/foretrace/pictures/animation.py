@@ -1,15 +1,18 @@
-"""Moving pictures of interactions: the solid object, the blade, and the paths as they unroll."""
+"""Moving pictures of interactions: the solid object, the blade, and the paths as they unroll.
+
+Matplotlib draws once what stays the same, diagrams and legends; what moves is drawn onto it, which takes milliseconds.
+"""
 
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
@@ -19,8 +22,16 @@ from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, tr
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject
 from foretrace.objects.surface import faces_of
-from foretrace.pictures.scene import TOOL_REACH, Scene, draw_over_time, legend_of, tool_line
-from foretrace.pictures.style import CM, INK, OBJECT_EDGE, STYLE, SUPPORT_COLOR, TOOL_COLOR
+from foretrace.pictures.scene import TOOL_REACH, Scene, Trace, draw_over_time, legend_of, tool_line
+from foretrace.pictures.style import (
+    CM,
+    INK,
+    OBJECT_EDGE,
+    PREDICTION_COLORS,
+    STYLE,
+    SUPPORT_COLOR,
+    TOOL_COLOR,
+)
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)
 """Where the camera stands: turned from the action's direction towards its right, and raised."""
@@ -32,6 +43,14 @@ DRAWN_FACETS = 4
 """Of a cylinder's facets every fourth edge is drawn, so that one sees it roll."""
 LAST_FRAME_TIME = 1.2
 """How long an animation rests on its end before it repeats [s]."""
+TUBE_STRENGTH = 0.2
+"""Opacity of the prediction region."""
+DASH = 8.0
+"""Length of the dashes of predicted paths, and of the gaps between them [pixels]."""
+SUBPIXELS = 4
+"""Bits of the fraction of a pixel to which shapes are drawn."""
+COLORS = 128
+"""Colours of a GIF."""
 
 
 def interaction_animation(
@@ -70,24 +89,32 @@ def frames(scene: Scene, width: int = 960, height: int = 450) -> Iterator[np.nda
     with mpl.rc_context(STYLE):
         fig = Figure(figsize=(width / 100, height / 100), dpi=100)
         canvas = FigureCanvasAgg(fig)
-        grid = fig.add_gridspec(3, 2, width_ratios=[2.1, 1.0], left=0.01, right=0.985, bottom=0.22, top=0.88)
-        stage = fig.add_subplot(grid[:, 0])
-        first = fig.add_subplot(grid[0, 1])
-        axes = [first, *(fig.add_subplot(grid[k, 1], sharex=first) for k in (1, 2))]
+        handles = legend_of(scene)
+        grid = fig.add_gridspec(3, 2, width_ratios=[1.7, 1.0], left=0.01, right=0.985, bottom=0.24, top=0.88)
+        axes = [fig.add_subplot(grid[k, 1]) for k in range(3)]
         draw_over_time(axes, scene)
-        cursors = [ax.axvline(0, color=INK, linewidth=1) for ax in axes]
+        for ax in axes:
+            ax.set_xlim(float(scene.times[0]), max(float(scene.times[-1]), float(scene.times[0]) + 0.05))
         fig.suptitle(scene.title, x=0.015, ha="left", fontsize=12, fontweight="bold")
-        fig.legend(handles=legend_of(scene), loc="lower left", fontsize=8.5)
-        limits = _limits(scene)
-        for k, time in enumerate(scene.times):
-            stage.clear()
-            _draw_stage(stage, scene, k)
-            stage.set(xlim=limits[0], ylim=limits[1], aspect="equal", anchor="W")
-            stage.axis("off")
-            for cursor in cursors:
-                cursor.set_xdata([time, time])
-            canvas.draw()
-            yield np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+        fig.legend(handles=handles, loc="lower left", fontsize=8.5, ncols=1 if len(handles) < 3 else 2)
+        stage = fig.add_axes((0.01, 0.15, 0.56, 0.78))
+        (x0, x1), (y0, y1) = _limits(scene)
+        stage.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", anchor="C")
+        stage.axis("off")
+        canvas.draw()
+        still = np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+        origin, one = stage.transData.transform([[0.0, 0.0], [1.0, 1.0]])
+        shown = _Stage(scene, one - origin, origin, (height, int(stage.bbox.extents[2])))
+        bars = [ax.bbox.extents for ax in axes]
+    shown.draw_table(still)
+    low, high = axes[0].get_xlim()
+    for k, time in enumerate(scene.times):
+        picture = still.copy()
+        shown.draw(picture, k)
+        for left, bottom, right, top in bars:
+            column = left + (right - left) * (time - low) / (high - low)
+            _line(picture, np.array([[column, height - top], [column, height - bottom]]), INK, 1)
+        yield picture
 
 
 def project(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -97,6 +124,140 @@ def project(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         [np.cos(ELEVATION) * np.cos(AZIMUTH), np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION)]
     )
     return points @ np.stack([right, np.cross(towards, right), towards]).T
+
+
+class _Stage:
+    """The part of a picture that moves.
+
+    Args:
+        scene: What is shown.
+        scale: Pixels per projected centimetre, to the right and up.
+        origin: Pixel of the projected origin, counted up from below.
+        size: Height of the picture, and the column where this part of it ends [pixels].
+    """
+
+    def __init__(self, scene: Scene, scale: np.ndarray, origin: np.ndarray, size: tuple[int, int]):
+        self.scene, self._scale, self._origin, self._size = scene, scale, origin, size
+        self._faces = faces_of(scene.obj, DRAWN_FACETS)
+        is_mesh = isinstance(scene.obj.shape, MeshObject)
+        self._edges = None if is_mesh else OBJECT_EDGE  # no triangles on meshes
+        self._traces = [(trace, self._pixels(trace.path)) for trace in scene.paths()]
+        self._tube = self._shape_of_tube()
+
+    def draw_table(self, picture: np.ndarray) -> None:
+        """The table top around the object."""
+        corners = self._pixels(_table_corners(self.scene))
+        _fill(picture, corners, "#f1f2f4")
+        _line(picture, np.concatenate([corners, corners[:1]]), "#d9dce1", 1)
+
+    def draw(self, picture: np.ndarray, k: int) -> None:
+        """The object's shadow, object and blade, other motions, the region, and the paths up to sample ``k``."""
+        scene = self.scene
+        pose = pose_to_matrix(scene.pose[k])
+        body = [transform_points(pose, face) for face in self._faces]
+        shadow = convex_hull(np.concatenate(body)[:, :2])
+        _fill(picture, self._pixels(np.column_stack([shadow, np.zeros(len(shadow))])), "#cfd3da")
+        self._draw_solids(picture, body, None if scene.tool is None else scene.tool[k])
+        for ghost in scene.ghosts:
+            self._draw_edges(picture, ghost.pose[min(k, len(ghost.pose) - 1)], ghost.color, ghost.width)
+        if scene.support_points is not None:
+            at_rest = np.column_stack([scene.support_points, np.zeros(2)])
+            ends = self._pixels(transform_points(pose @ invert_transform(scene.placement), at_rest))
+            _line(picture, ends, SUPPORT_COLOR, 2)
+            for end in ends:
+                _dot(picture, end, SUPPORT_COLOR, 4.0)
+        if self._tube is not None:
+            box, shape = self._tube
+            part = picture[box]
+            tinted = part * (1 - shape) + shape * np.array(_rgb(PREDICTION_COLORS[0]))
+            part[:] = tinted.astype(np.uint8)
+        for trace, pixels in self._traces:
+            self._draw_trace(picture, trace, pixels, k)
+
+    def _draw_solids(self, picture: np.ndarray, body: list[np.ndarray], tool: np.ndarray | None) -> None:
+        faces = [(face, _shaded("#c3d3e6", face), self._edges) for face in body if _faces_us(face)]
+        if tool is not None:
+            tip = pose_to_matrix(tool)
+            blade = [transform_points(tip, face) for face in _tool_faces()]
+            faces += [(face, _shaded(TOOL_COLOR, face), None) for face in blade]
+        faces.sort(key=lambda face: project(face[0])[:, 2].mean())  # the far ones first
+        for face, color, edge in faces:
+            corners = self._pixels(face)
+            _fill(picture, corners, color)
+            _line(picture, np.concatenate([corners, corners[:1]]), edge or color, 1)
+
+    def _draw_edges(self, picture: np.ndarray, pose: np.ndarray, color: str, width: float) -> None:
+        placed = [transform_points(pose_to_matrix(pose), face) for face in self._faces]
+        for face in placed:
+            if _faces_us(face):
+                corners = self._pixels(face)
+                _line(picture, np.concatenate([corners, corners[:1]]), color, round(width))
+
+    def _draw_trace(self, picture: np.ndarray, trace: Trace, pixels: np.ndarray, k: int) -> None:
+        _line(picture, pixels, _paler(trace.color), 1)
+        so_far = pixels[: k + 1]
+        for part in [so_far] if trace.style == "-" else _dashes(so_far):
+            _line(picture, part, trace.color, 2 if trace.width < 2 else 3)
+        _dot(picture, so_far[-1], trace.color, 5.0)
+
+    def _shape_of_tube(self) -> "tuple[tuple[slice, slice], np.ndarray] | None":
+        """Where the prediction region lies in the picture, and its opacity there (rows, columns, 1)."""
+        band = self.scene.band
+        if band.radius is None:
+            return None
+        centres, radii = self._pixels(band.path), CM * self._scale[0] * band.radius
+        shape = np.zeros(self._size, dtype=np.uint8)
+        discs = centres[:, None] + radii[:, None, None] * _CIRCLE
+        for pair in pairwise(discs):
+            swept = _fixed(convex_hull(np.concatenate(pair)))
+            cv2.fillConvexPoly(shape, swept, (255.0,), cv2.LINE_AA, SUBPIXELS)
+        columns, rows = np.flatnonzero(shape.any(axis=0)), np.flatnonzero(shape.any(axis=1))
+        if not len(columns):
+            return None
+        box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        return box, TUBE_STRENGTH * shape[box][..., None] / 255.0
+
+    def _pixels(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Columns and rows of points in the action frame."""
+        flat = project(points)[:, :2] * CM * self._scale + self._origin
+        return np.column_stack([flat[:, 0], self._size[0] - flat[:, 1]])
+
+
+_CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 32, endpoint=False)) for f in (np.cos, np.sin)])
+
+
+def _rgb(color: Any) -> tuple[float, float, float]:
+    red, green, blue = (255 * value for value in to_rgb(color))
+    return red, green, blue
+
+
+def _paler(color: str) -> tuple[float, ...]:
+    return tuple(0.35 * value + 0.65 * 0.92 for value in to_rgb(color))
+
+
+def _fixed(points: np.ndarray) -> np.ndarray:
+    """Pixels as OpenCV takes them, in fractions; a pixel's middle is a whole number there."""
+    return np.round((points - 0.5) * 2**SUBPIXELS).astype(np.int32)
+
+
+def _fill(picture: np.ndarray, corners: np.ndarray, color: Any) -> None:
+    cv2.fillPoly(picture, [_fixed(corners)], _rgb(color), cv2.LINE_AA, SUBPIXELS)
+
+
+def _line(picture: np.ndarray, points: np.ndarray, color: Any, width: int) -> None:
+    cv2.polylines(picture, [_fixed(points)], False, _rgb(color), max(width, 1), cv2.LINE_AA, SUBPIXELS)
+
+
+def _dot(picture: np.ndarray, point: np.ndarray, color: Any, radius: float) -> None:
+    _fill(picture, point + radius * _CIRCLE, color)
+
+
+def _dashes(points: Float[np.ndarray, "n 2"]) -> list[Float[np.ndarray, "_ 2"]]:
+    """Parts of a path, every other one of the length of a dash."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    places = np.arange(0.0, length[-1], DASH / 4)
+    fine = np.column_stack([np.interp(places, length, points[:, column]) for column in (0, 1)])
+    return [fine[k : k + 5] for k in range(0, len(fine), 8)]
 
 
 def _tool_faces() -> list[np.ndarray]:
@@ -117,44 +278,10 @@ def _faces_us(face: np.ndarray) -> bool:
     return bool(project(_normal(face))[2] > 0)
 
 
-def _shaded(color: str, face: np.ndarray) -> np.ndarray:
+def _shaded(color: str, face: np.ndarray) -> tuple[float, ...]:
     """The colour of a face under the light."""
     facing = max(float(_normal(face) @ LIGHT), 0.0)
-    return np.clip(np.array(to_rgb(color)) * (0.72 + 0.36 * facing), 0, 1)
-
-
-def _draw_stage(ax: Axes, scene: Scene, k: int) -> None:
-    """The table, the object's shadow, object and blade, and the paths up to sample ``k``."""
-    _draw_table(ax, scene)
-    pose = pose_to_matrix(scene.pose[k])
-    body = [transform_points(pose, face) for face in faces_of(scene.obj, DRAWN_FACETS)]
-    shadow = convex_hull(np.concatenate(body)[:, :2])
-    ground = project(np.column_stack([shadow, np.zeros(len(shadow))]))[:, :2] * CM
-    ax.fill(*ground.T, color="#cfd3da", linewidth=0, zorder=1)
-    faces = [(face, _shaded("#c3d3e6", face)) for face in body if _faces_us(face)]
-    if scene.tool is not None:
-        tip = pose_to_matrix(scene.tool[k])
-        blade = [transform_points(tip, face) for face in _tool_faces()]
-        faces += [(face, _shaded(TOOL_COLOR, face)) for face in blade]
-    faces.sort(key=lambda face: project(face[0])[:, 2].mean())  # the far ones first
-    polygons, colors = [project(face)[:, :2] * CM for face, _ in faces], [color for _, color in faces]
-    edges = colors if isinstance(scene.obj.shape, MeshObject) else OBJECT_EDGE  # no triangles on meshes
-    ax.add_collection(PolyCollection(polygons, facecolors=colors, edgecolors=edges, linewidths=0.9, zorder=2))
-    if scene.support_points is not None:
-        at_rest = np.column_stack([scene.support_points, np.zeros(2)])
-        carried = project(transform_points(pose @ invert_transform(scene.placement), at_rest)) * CM
-        ax.plot(*carried[:, :2].T, color=SUPPORT_COLOR, linewidth=2, marker="o", zorder=3)
-    for _, path, color, style, width in scene.paths():
-        faint, so_far = project(path)[:, :2] * CM, project(path[: k + 1])[:, :2] * CM
-        ax.plot(*faint.T, color=color, linewidth=1.0, alpha=0.35, zorder=3)
-        ax.plot(*so_far.T, color=color, linestyle=style, linewidth=width + 0.4, zorder=4)
-        ax.plot(*so_far[-1], color=color, marker="o", markersize=6, zorder=5)
-
-
-def _draw_table(ax: Axes, scene: Scene) -> None:
-    """The table top around the object."""
-    flat = project(_table_corners(scene))[:, :2] * CM
-    ax.fill(*flat.T, facecolor="#f1f2f4", edgecolor="#d9dce1", linewidth=1, zorder=0)
+    return tuple(np.clip(np.array(to_rgb(color)) * (0.72 + 0.36 * facing), 0, 1).tolist())
 
 
 def _table_corners(scene: Scene) -> np.ndarray:
@@ -170,7 +297,8 @@ def _table_corners(scene: Scene) -> np.ndarray:
 def _limits(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
     """Range of the projected scene over its whole time [cm]."""
     faces = np.concatenate(faces_of(scene.obj, DRAWN_FACETS))
-    few = scene.pose[:: max(1, len(scene.pose) // 12)]
+    moved = [scene.pose, *(ghost.pose for ghost in scene.ghosts)]
+    few = np.concatenate([pose[:: max(1, len(pose) // 12)] for pose in moved])
     seen = [_table_corners(scene), *(transform_points(pose_to_matrix(pose), faces) for pose in few)]
     seen += [path for _, path, *_ in scene.paths()]
     if scene.tool is not None:
@@ -182,7 +310,7 @@ def _limits(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], period: float) -> None:
     images = [Image.fromarray(picture) for picture in pictures]
-    palette = images[len(images) // 2].quantize(128, dither=Image.Dither.NONE)
+    palette = images[len(images) // 2].quantize(COLORS, dither=Image.Dither.NONE)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [round(1000 * period)] * (len(images) - 1) + [round(1000 * LAST_FRAME_TIME)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)

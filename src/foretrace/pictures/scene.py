@@ -3,7 +3,7 @@
 All is drawn in the action frame: x along the action, y to the left, z up.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,7 +17,12 @@ from matplotlib.patches import Patch
 
 from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError, PredictionError
-from foretrace.geometry import matrix_to_pose, pose_to_matrix, transform_points
+from foretrace.geometry import (
+    matrix_to_pose,
+    pose_to_matrix,
+    rotation_vector_to_quaternion,
+    transform_points,
+)
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject, ObjectModel
 from foretrace.pictures.bands import PredictionBand
@@ -41,6 +46,17 @@ TOOL_REACH = 0.12
 """How much of the screwdriver is drawn, from its tip backwards [m]."""
 ARROW_LENGTH = 0.045
 """Length of the arrow that shows the action [m]."""
+
+
+class Ghost(NamedTuple):
+    """A motion of the object that is predicted beside the one that is shown, drawn as its edges."""
+
+    pose: np.ndarray
+    """Object frame in the action frame over time (time, 7)."""
+    color: str
+    """Its colour."""
+    width: float
+    """Width of its edges."""
 
 
 class Trace(NamedTuple):
@@ -79,6 +95,8 @@ class Scene:
     """What it is, in a line."""
     band: PredictionBand = field(default_factory=PredictionBand)
     """What else may happen; drawn in the colour of the first prediction."""
+    ghosts: Sequence[Ghost] = ()
+    """Other motions of the object, which animations show."""
 
     @classmethod
     def observed(
@@ -117,15 +135,22 @@ class Scene:
         predictions: Mapping[str, np.ndarray],
         pose: Float[np.ndarray, "time 7"] | None = None,
     ) -> "Scene":
-        """A lever-up that has not happened; without imagined poses the object is drawn at rest."""
+        """A lever-up that has not happened, with the blade's planned path.
+
+        Without imagined poses the object is drawn at rest, and the title says so.
+        """
         at_rest = np.tile(matrix_to_pose(action.T_action_object), (len(times), 1))
+        planned = action.tool_motion(times)
+        turned = rotation_vector_to_quaternion(planned[:, 3:])
+        title = "Predicted lever-up" if pose is not None else "Predicted path of a lever-up; object at rest"
         return cls(
             obj=obj,
             placement=action.T_action_object,
             times=times,
             pose=at_rest if pose is None else pose,
             predictions=_checked(predictions),
-            title=f"Imagined lever-up, {len(obj.corners)} corners",
+            tool=np.concatenate([planned[:, :3], turned], axis=1),
+            title=f"{title}, {len(obj.corners)} corners",
         )
 
     @property
