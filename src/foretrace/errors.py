@@ -94,6 +94,10 @@ class RobotError(ForetraceError):
     """A real arm that cannot be reached, a path that it must not follow, or a motion that was stopped."""
 
 
+class StudioError(ForetraceError):
+    """A studio or a service that cannot start, or a wish of a visitor that it cannot grant: too large, too many."""
+
+
 class ExportError(ForetraceError):
     """An export that cannot be written: nothing chosen, the target exists, a library is missing, uneven sampling."""
 

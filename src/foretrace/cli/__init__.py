@@ -47,6 +47,7 @@ COMMANDS: dict[str, Entry] = {
     "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
     "plan": _command("planning:plan", "Choose where and how an object is levered for a goal.", LEARN),
     "monitor": _command("monitor:monitor", "Watch a recorded action as a monitor would have.", LEARN),
+    "studio": _command("studio:studio", "Try lever-ups in the browser: draw, drag, plan.", LEARN),
     "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
     "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or print its board or markers.", SEE),
     "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),

@@ -1,0 +1,64 @@
+"""Commands that serve a page or an interface: studio, serve."""
+
+import importlib
+from pathlib import Path
+
+from foretrace.errors import StudioError
+
+
+def studio(
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    data: Path | None = None,
+    at: str = "",
+    dark: bool = False,
+) -> None:
+    """Try lever-ups in the browser: draw an object, drag the screwdriver round it, plan. Needs foretrace[studio].
+
+    Every visitor has a page of their own. By default nobody but this machine reaches it.
+
+    Args:
+        host: Address to listen at; 0.0.0.0 lets other machines in, whoever they are.
+        port: Port to listen at; the next free one is taken.
+        data: Data set whose objects can be chosen.
+        at: What is chosen at first, as the end of a link that the studio makes.
+        dark: Dark page.
+    """
+    require("viser")
+    from foretrace.interactions.dataset import Dataset
+    from foretrace.studio.choices import Choices
+    from foretrace.studio.server import StudioServer
+
+    check_port(port)
+    choices = Choices.from_text(at)
+    served = StudioServer(host, port, choices, None if data is None else Dataset.open(data), dark)
+    try:
+        print(f"http://{served.address}", flush=True)
+        served.wait()
+    finally:
+        served.stop()
+
+
+def require(*modules: str) -> None:
+    """Make sure that optional libraries are there.
+
+    Raises:
+        StudioError: One is not installed.
+    """
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise StudioError(
+                f"{module} is not installed: install it with `pip install 'foretrace[studio]'`"
+            ) from error
+
+
+def check_port(port: int) -> None:
+    """Refuse a port that there is not.
+
+    Raises:
+        StudioError: Naming it.
+    """
+    if not 0 <= port <= 65535:
+        raise StudioError(f"--port is {port}: give a number from 0 to 65535")

@@ -1,0 +1,331 @@
+"""A visitor's page: passes on what the visitor does to the session, and draws what follows."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import count
+from threading import Event, RLock, Thread
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from foretrace.errors import ForetraceError, StudioError
+from foretrace.interactions.dataset import Dataset
+from foretrace.planning import Plan
+from foretrace.studio.choices import Choices
+from foretrace.studio.controls import OWN, Controls
+from foretrace.studio.scenery import futures_of, observed_motion, shown_times
+from foretrace.studio.session import LEVEL, Session, Simulated
+from foretrace.studio.shapes import MOST_CORNERS, checked, example, from_file, from_text, prism_of
+from foretrace.studio.stage import Stage
+
+FRAME = 1 / 25
+"""Time between two pictures while time runs [s]."""
+PAUSE = 0.8
+"""How long the end is shown before time begins anew [s]."""
+
+
+class Page:
+    """The page of one visitor.
+
+    Args:
+        client: The visitor's browser.
+        choices: What is chosen at first.
+        data: Data set that objects can be taken from.
+        message: What the visitor is told at first.
+    """
+
+    def __init__(self, client: Any, choices: Choices, data: Dataset | None = None, message: str = "") -> None:
+        self.session = Session(choices)
+        """What is chosen, and what follows."""
+        self.latencies: list[float] = []
+        """Seconds from each of the last events to its picture."""
+        self._client, self._data = client, data
+        self._lock, self._numbers, self._latest = RLock(), count(1), 0
+        self._closed = Event()
+        self._drawn: list[np.ndarray] | None = None
+        self._dragged: tuple[np.ndarray, bool] | None = None
+        self._simulated: Simulated | None = None
+        self._message = ""
+        self.stage = Stage(client)
+        self.controls = Controls(client.gui, choices, self._choose, data is not None)
+        self._connect()
+        self.stage.show_object(choices.object)
+        self.act(lambda: None, message)
+        self._player = Thread(target=self._let_time_run, daemon=True, name="foretrace-studio-time")
+        self._player.start()
+
+    def close(self) -> None:
+        """The visitor has gone."""
+        self._closed.set()
+
+    # --- what the visitor does ---------------------------------------------------------------------------
+
+    def act(self, work: Callable[[], None], message: str = "") -> None:
+        """Do something, and draw what follows; of several such wishes at once, the last one is drawn.
+
+        Args:
+            work: What is to be done.
+            message: What the visitor is told about it; an error takes its place.
+        """
+        started = perf_counter()
+        self._latest = number = next(self._numbers)
+        with self._lock:
+            if self._closed.is_set():
+                return
+            self._message = message
+            try:
+                work()
+            except ForetraceError as error:
+                self._message = str(error)
+            if number == self._latest and not self._closed.is_set():
+                self._draw()
+                self.latencies = [*self.latencies[-999:], perf_counter() - started]
+                self._draw_what_takes_time(number)
+
+    def _choose(self, name: str) -> None:
+        def work() -> None:
+            slider = self.controls.sliders.get(name)
+            self.session.change(**{name: slider.value if slider else getattr(self.controls, name).value})
+
+        self.act(work)
+
+    def _connect(self) -> None:
+        controls = self.controls
+        for name in ("exact", "imaginer", "goal"):
+            _on(getattr(controls, name), lambda name=name: self._choose(name))
+        for handle in (controls.tubes, controls.twin, controls.rim):
+            _on(handle, lambda: self.act(lambda: None))
+        _on(controls.time, lambda: self._show_time(float(controls.time.value)))
+        _on(controls.example, lambda: self.act(self._take_example))
+        _on(controls.draw, lambda: self.act(lambda: self._draw_outline(True)))
+        _on(controls.undraw, lambda: self.act(lambda: self._draw_outline(False)))
+        _on(controls.drawn, lambda: self.act(self._finish_outline))
+        _on(controls.use_corners, lambda: self.act(self._take_corners))
+        _on(controls.use_row, lambda: self.act(self._take_row))
+        _on(controls.plan, lambda: self.act(self._plan))
+        _on(controls.alternatives, lambda: self.act(self._look_at))
+        _on(controls.simulate, lambda: self.act(self._simulate))
+        controls.upload.on_upload(lambda event: self.act(self._take_file))
+        for handle in (self.stage.grip, *self.stage.parts):
+            for modifier in (None, "shift"):
+                handle.on_drag("left", modifier=modifier)(self._drag)
+
+    async def _drag(self, event: Any) -> None:
+        """Note where the pointer is on the table; in order, and at once. What follows is worked out elsewhere."""
+        eye = np.array(event.client.camera.position)
+        way = np.array(event.end_position) - eye
+        if abs(way[2]) < 1e-6 or (reach := -eye[2] / way[2]) <= 0:
+            return
+        self._dragged = (eye + reach * way)[:2], event.modifier == "shift"
+        self._client._viser_server._thread_executor.submit(lambda: self.act(self._follow))
+
+    def _follow(self) -> None:
+        """Bring the contact, or the direction, to where the pointer is."""
+        if self._dragged is None:
+            return
+        point, turns = self._dragged
+        if not turns:
+            self.session.move_to(point)
+            return
+        action, chosen = self.session.action, self.session.choices
+        way = action.contact - point
+        if np.linalg.norm(way) > 1e-3:
+            old = np.arctan2(action.direction[1], action.direction[0])
+            change = np.arctan2(way[1], way[0]) - old
+            turn = chosen.turn + (change + np.pi) % (2 * np.pi) - np.pi
+            self.session.change(turn=float(np.clip(turn, -0.6, 0.6)))
+
+    def _take(self, obj: Any) -> None:
+        """Another object."""
+        self.session.change(object=obj, along=0.1, turn=0.0)
+        self._simulated = None
+        self.stage.show_object(obj)
+        middle = obj.corners.mean(axis=0)
+        self._client.camera.look_at = (*middle.tolist(), 0.03)
+
+    def _take_example(self) -> None:
+        if self.controls.example.value != OWN:
+            self._take(example(self.controls.example.value))
+
+    def _take_corners(self) -> None:
+        self._take(from_text(self.controls.corners.value, self._height()))
+
+    def _take_file(self) -> None:
+        file = self.controls.upload.value
+        self._take(
+            from_file(file.name, file.content, self._height(), 0.001 * float(self.controls.scale.value))
+        )
+
+    def _take_row(self) -> None:
+        if self._data is None:
+            return
+        interaction = self._data.with_id(int(self.controls.row.value))
+        self._take(checked(interaction.object))
+        self.session.take(interaction.action)  # pyright: ignore[reportArgumentType]
+
+    def _height(self) -> float:
+        return 0.001 * float(self.controls.height.value)
+
+    def _draw_outline(self, begins: bool) -> None:
+        """Begin or end drawing."""
+        controls = self.controls
+        self._drawn = [] if begins else None
+        controls.draw.visible = not begins
+        controls.drawn.visible = controls.undraw.visible = begins
+        self.stage.hide_object(begins)
+        self.stage.show_drawing(np.zeros((0, 2)))
+        self._client.scene.remove_click_callback("all")
+        if begins:
+            self._client.scene.on_click()(self._add_corner)
+            self._message = "click the corners of an outline on the table, in order"
+
+    def _add_corner(self, event: Any) -> None:
+        origin, way = np.array(event.ray_origin), np.array(event.ray_direction)
+
+        def work() -> None:
+            if self._drawn is None or way[2] > -1e-6:
+                return
+            if len(self._drawn) >= MOST_CORNERS:
+                raise StudioError(f"the outline has {MOST_CORNERS} corners already: finish it")
+            self._drawn.append((origin - origin[2] / way[2] * way)[:2])
+            self.stage.show_drawing(np.array(self._drawn))
+            self._message = f"{len(self._drawn)} corners"
+
+        self.act(work)
+
+    def _finish_outline(self) -> None:
+        corners = np.array(self._drawn or []).reshape(-1, 2)
+        obj = prism_of(corners, self._height())
+        self._draw_outline(False)
+        self._message = ""
+        self._take(obj)
+
+    def _plan(self) -> None:
+        self.controls.planned.content = "looking around ..."
+        try:
+            found = self.session.plan_best()
+        except ForetraceError:
+            self.controls.planned.content = ""
+            raise
+        self._simulated = None
+        self.controls.planned.content = plan_text(found)
+        names = ["the best", *(f"alternative {k}" for k in range(2, len(found.alternatives) + 2))]
+        self.controls.alternatives.options = tuple(names)
+        self.controls.alternatives.value = names[0]
+        self.controls.alternatives.visible = len(names) > 1
+
+    def _look_at(self) -> None:
+        found, name = self.session.plan, self.controls.alternatives.value
+        if found is None:
+            return
+        number = 1 if name == "the best" else int(name.split()[-1])
+        self.session.take(found.action if number == 1 else found.alternatives[number - 2].action)
+        self.session.plan = found
+
+    def _simulate(self) -> None:
+        self._simulated = self.session.simulate()
+        effect, tried = self._simulated.interaction.effect, self.session.simulations
+        drawn = ", ".join(
+            f"{name.replace('_', ' ')} {value:.3g}" for name, value in self._simulated.drawn.items()
+        )
+        text = f"**{effect.outcome}** in MuJoCo (green)"
+        if tried:
+            text += f"; the {LEVEL:.0%} region held {sum(tried)} of {len(tried)}"
+        self.controls.simulated.content = text + (f"\n\ndrawn: {drawn}" if drawn else "")
+
+    # --- what the visitor sees ---------------------------------------------------------------------------
+
+    def _draw(self) -> None:
+        """Draw what follows from the choices; within a drag, this is what takes time."""
+        session, controls, stage = self.session, self.controls, self.stage
+        if self._drawn is not None:
+            controls.show_result(None, self._message)
+            return
+        action = session.action
+        try:
+            imagined = session.imagined
+        except ForetraceError as error:
+            imagined = None
+            self._message = self._message or str(error)
+        if not session.simulations and self._simulated is not None and self._simulated.held is not None:
+            self._simulated = None
+            controls.simulated.content = ""
+        with self._client.atomic():
+            controls.show_choices(session.choices)
+            controls.show_result(imagined, self._message)
+            times = np.zeros(1) if imagined is None else shown_times(imagined, action)
+            futures = [] if imagined is None else futures_of(imagined, action, LEVEL)
+            stage.show_contact(action, times)
+            stage.show_futures(futures, controls.tubes.value)
+            effect = None if self._simulated is None else self._simulated.interaction.effect
+            stage.show_other("simulated", None if effect is None else observed_motion(effect, action))
+            if not controls.twin.value:
+                stage.show_other("twin", None)
+            if controls.time.max != (end := max(float(times[-1]), 0.05)):
+                controls.time.max = end
+        stage.show_time(float(controls.time.value))
+
+    def _draw_what_takes_time(self, number: int) -> None:
+        """The twin's motion and the rim, unless the visitor has gone on meanwhile."""
+        session, stage = self.session, self.stage
+        if self._drawn is not None:
+            stage.show_rim(None)
+            return
+        for wanted, show in (
+            (self.controls.rim.value, self._draw_rim),
+            (self.controls.twin.value, self._draw_twin),
+        ):
+            if wanted and number == self._latest:
+                try:
+                    show()
+                except ForetraceError as error:
+                    self.controls.show_result(None, str(error))
+        if not self.controls.rim.value:
+            stage.show_rim(None)
+        with suppress(ForetraceError):
+            self.controls.show_result(session.imagined, self._message)
+
+    def _draw_rim(self) -> None:
+        self.stage.show_rim(self.session.rim)
+
+    def _draw_twin(self) -> None:
+        action = self.session.action
+        futures = futures_of(self.session.twin, action, LEVEL)
+        self.stage.show_other("twin", futures[0])
+        self.stage.show_time(float(self.controls.time.value))
+
+    def _show_time(self, time: float) -> None:
+        self.stage.show_time(time)
+
+    def _let_time_run(self) -> None:
+        """While `play` is on, until the visitor goes."""
+        now, last = float(self.controls.time.value), perf_counter()
+        while not self._closed.wait(FRAME):
+            elapsed, last = perf_counter() - last, perf_counter()
+            if not self.controls.play.value or self._drawn is not None:
+                now = float(self.controls.time.value)
+                continue
+            end = float(self.controls.time.max)
+            now = 0.0 if now > end + PAUSE else now + elapsed
+            self.controls.time.value = min(round(now / 0.05) * 0.05, end)
+            self.stage.show_time(min(now, end))
+
+
+def plan_text(found: Plan) -> str:
+    """A plan in a few lines of Markdown."""
+    lines = [f"**{found.goal}**: reached with a probability of {found.reached:.0%}"]
+    lines += [f"probability of {name}: {chance:.1%}" for name, chance in found.chances.items()]
+    lines += [f"*{found.note}*"] if found.note else []
+    lines += [f"{k}. {other.lost}" for k, other in enumerate(found.alternatives, start=2)]
+    return "\n\n".join(lines)
+
+
+def _on(handle: Any, work: Callable[[], None]) -> None:
+    """Do something when the visitor, not the page, uses a button or changes a value."""
+    listen = getattr(handle, "on_click", None) or handle.on_update
+
+    @listen
+    def _(event: Any) -> None:
+        if event.client_id is not None:
+            work()

@@ -1,0 +1,242 @@
+"""The three-dimensional part of a visitor's page, in viser: table, object, screwdriver, futures, tubes, rim."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import to_rgb
+
+from foretrace.actions import LeverUp
+from foretrace.geometry import matrix_to_pose
+from foretrace.objects import ObjectModel
+from foretrace.objects.surface import triangles_of
+from foretrace.pictures.style import (
+    INK,
+    OBJECT_EDGE,
+    OUTCOME_COLORS,
+    SUPPORT_COLOR,
+    TRUTH_COLOR,
+)
+from foretrace.planning import RimCost
+from foretrace.studio.scenery import (
+    MOST_FUTURES,
+    Moving,
+    edges_of,
+    rim_segments,
+    tool_poses_of,
+    tube,
+)
+
+OBJECT = (158, 186, 214)
+TABLE = (226, 224, 219)
+GRIP = (240, 120, 20)
+TWIN = (150, 90, 170)
+GRIP_BEHIND, GRIP_RADIUS = 0.05, 0.007
+"""The grip lies so far behind the contact; its radius [m]."""
+CAMERA, LOOK_AT = (0.13, -0.4, 0.26), (0.0, 0.0, 0.03)
+"""Where the camera is at first, and what it looks at [m]."""
+TABLE_SIZE = (0.9, 0.9, 0.012)
+"""The table [m]."""
+LINE = 0.0009
+"""Thickness of lines [m]."""
+
+
+def colour_of(name: str) -> tuple[int, int, int]:
+    """Colour of an outcome, or of a name of matplotlib: red, green and blue, 0 to 255."""
+    red, green, blue = to_rgb(OUTCOME_COLORS.get(name, name if name.startswith("#") else INK))
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+class Stage:
+    """What one visitor sees in three dimensions.
+
+    Args:
+        client: The visitor's browser.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._scene = client.scene
+        self._movers: dict[str, tuple[Any, Moving]] = {}
+        self._ghosts: list[Any] = []
+        self._object: Any = None
+        self._tool_poses = np.zeros((0, 4, 4))
+        self._times = np.zeros(0)
+        client.camera.position, client.camera.look_at = CAMERA, LOOK_AT
+        client.camera.near, client.camera.min_orbit_distance = 0.005, 0.05
+        x, y, z = TABLE_SIZE
+        self._scene.add_box(
+            "/table", dimensions=(x, y, z), position=(0, 0, -z / 2), color=TABLE, cast_shadow=False
+        )
+        self._scene.add_grid(
+            "/grid", width=x, height=y, cell_size=0.01, section_size=0.1, cell_color=(205, 203, 198),
+            section_color=(180, 178, 172), cell_thickness=0.6, position=(0, 0, 0.0003), shadow_opacity=0.0,
+        )  # fmt: skip
+        self.tool = self._scene.add_frame("/tool", show_axes=False)
+        self.parts: list[Any] = []
+        self.grip = self._scene.add_icosphere("/grip", radius=GRIP_RADIUS, color=GRIP)
+        self._add_tool()
+
+    def _add_tool(self) -> None:
+        for part in LeverUp((0, 0), (1, 0)).tool.parts():
+            name, colour = f"/tool/{part.name}", tuple(round(255 * each) for each in part.colour)
+            place = {"position": part.pose[:3], "wxyz": part.pose[3:], "color": colour}
+            if part.shape == "box":
+                self.parts.append(
+                    self._scene.add_box(name, dimensions=tuple(2 * each for each in part.end), **place)
+                )
+            else:
+                height = part.length + 2 * part.radius
+                self.parts.append(self._scene.add_cylinder(name, radius=part.radius, height=height, **place))
+
+    # --- what is there -----------------------------------------------------------------------------------
+
+    def show_object(self, obj: ObjectModel) -> None:
+        """Another object, at rest."""
+        self._movers = {}
+        for name in (
+            "/object",
+            "/rest",
+            "/twin",
+            "/simulated",
+            *(f"/ghost{k}" for k in range(1, MOST_FUTURES)),
+        ):
+            self._remove(name)
+        self._object = obj
+        vertices, faces = triangles_of(obj)
+        look: dict[str, Any] = {"vertices": vertices, "faces": faces, "flat_shading": True}
+        self._scene.add_mesh_simple("/object", color=OBJECT, **look)
+        edges, edge_colour = edges_of(obj), colour_of(OBJECT_EDGE)
+        if len(edges):
+            self._scene.add_line_segments("/object/edges", edges, edge_colour, thickness=LINE)
+        closed = np.stack([obj.corners, np.roll(obj.corners, -1, axis=0)], axis=1)
+        rest = np.concatenate([closed, np.full((*closed.shape[:2], 1), 0.0008)], axis=-1)
+        self._scene.add_line_segments("/rest", rest, edge_colour, thickness=LINE)
+        for k in range(1, MOST_FUTURES):
+            self._scene.add_mesh_simple(f"/ghost{k}", opacity=0.22, visible=False, cast_shadow=False, **look)
+        self._scene.add_mesh_simple(
+            "/twin", color=TWIN, opacity=0.35, visible=False, cast_shadow=False, **look
+        )
+        self._scene.add_mesh_simple(
+            "/simulated", color=colour_of(TRUTH_COLOR), opacity=0.45, visible=False, cast_shadow=False, **look
+        )
+
+    def show_contact(self, action: LeverUp, times: Float[np.ndarray, " time"]) -> None:
+        """Where the blade meets the object, and how it moves."""
+        self._times, self._tool_poses = times, tool_poses_of(action, times)
+        tail = action.contact - GRIP_BEHIND * action.direction
+        self.grip.position = (*tail.tolist(), GRIP_RADIUS)
+        arrow = np.array([[[*tail, 0.0015], [*(action.contact - 0.004 * action.direction), 0.0015]]])
+        self._scene.add_arrows(
+            "/arrow", arrow, GRIP, shaft_radius=0.0012, head_radius=0.0035, head_length=0.01
+        )
+
+    def show_futures(self, futures: Sequence[Moving], tubes: bool) -> None:
+        """The expected future as the object, others as ghosts, and regions as tubes."""
+        for k in range(MOST_FUTURES):
+            name = "/object" if k == 0 else f"/ghost{k}"
+            future = futures[k] if k < len(futures) else None
+            self._put(name, future)
+            if future is None or future.radius is None or not tubes:
+                self._remove(f"/tube{k}")
+            else:
+                vertices, faces = tube(future.path, future.radius)
+                self._mesh(f"/tube{k}", vertices, faces, colour_of(future.outcome), 0.14 if k else 0.3)
+            self._path(f"/path{k}", future)
+            if future is not None and k > 0:
+                self._scene.get_handle_by_name(name).color = colour_of(future.outcome)
+            self._label(f"/label{k}", future if len(futures) > 1 else None)
+
+    def show_other(self, name: str, moving: Moving | None) -> None:
+        """The motion of the ``twin``, or the ``simulated`` one; None: none."""
+        self._put(f"/{name}", moving)
+        self._path(f"/{name}_path", moving, TWIN if name == "twin" else colour_of(TRUTH_COLOR))
+
+    def show_rim(self, rim: RimCost | None) -> None:
+        """Cost of each contact around the object; None: no rim."""
+        if rim is None:
+            self._remove("/rim")
+            return
+        points, colours = rim_segments(rim, self._object.corners)
+        self._scene.add_line_segments("/rim", points, colours, thickness=0.005)
+
+    def show_drawing(self, points: Float[np.ndarray, "n 2"]) -> None:
+        """Corners of an outline that is being drawn."""
+        self._remove("/drawing")
+        if not len(points):
+            return
+        corners = np.column_stack([points, np.full(len(points), 0.002)])
+        ink = colour_of(SUPPORT_COLOR)
+        self._scene.add_point_cloud("/drawing", corners, ink, point_size=0.006, point_shape="circle")
+        if len(points) > 1:
+            lines = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+            self._scene.add_line_segments("/drawing/lines", lines, ink, thickness=2 * LINE)
+
+    def hide_object(self, hidden: bool) -> None:
+        """Clear the table while an outline is drawn."""
+        for name in ("/object", "/rest", "/tool", "/grip", "/arrow"):
+            if (handle := self._scene.get_handle_by_name(name)) is not None:
+                handle.visible = not hidden
+
+    # --- when ----------------------------------------------------------------------------------------------
+
+    def show_time(self, time: float) -> None:
+        """Everything as it is at a time [s]."""
+        if not len(self._times):
+            return
+        k = int(np.abs(self._times - time).argmin())
+        with self._client.atomic():
+            _place(self.tool, self._tool_poses[k])
+            for handle, moving in self._movers.values():
+                _place(handle, moving.poses[min(k, len(moving.poses) - 1)])
+
+    # ---------------------------------------------------------------------------------------------------------
+
+    def _put(self, name: str, moving: Moving | None) -> None:
+        handle = self._scene.get_handle_by_name(name)
+        if handle is None:
+            return
+        handle.visible = moving is not None or name == "/object"
+        if moving is None:
+            self._movers.pop(name, None)
+            if name == "/object":
+                _place(handle, np.eye(4))
+        else:
+            self._movers[name] = (handle, moving)
+
+    def _mesh(self, name: str, vertices: np.ndarray, faces: np.ndarray, colour: Any, opacity: float) -> None:
+        self._scene.add_mesh_simple(
+            name,
+            vertices,
+            faces,
+            color=colour,
+            opacity=opacity,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _path(self, name: str, moving: Moving | None, colour: tuple[int, int, int] | None = None) -> None:
+        if moving is None:
+            self._remove(name)
+            return
+        lines = np.stack([moving.path[:-1], moving.path[1:]], axis=1)
+        self._scene.add_line_segments(name, lines, colour or colour_of(moving.outcome), thickness=1.5 * LINE)
+
+    def _label(self, name: str, moving: Moving | None) -> None:
+        if moving is None:
+            self._remove(name)
+            return
+        place = moving.path[-1] + np.array([0.0, 0.0, 0.012])
+        text = f"{moving.outcome} {moving.probability:.0%}"
+        self._scene.add_label(name, text, position=place, anchor="bottom-center", font_screen_scale=0.9)
+
+    def _remove(self, name: str) -> None:
+        if (handle := self._scene.get_handle_by_name(name)) is not None:
+            handle.remove()
+
+
+def _place(handle: Any, T: Float[np.ndarray, "4 4"]) -> None:
+    pose = matrix_to_pose(T)
+    handle.position, handle.wxyz = pose[:3], pose[3:]
