@@ -17,7 +17,7 @@ import foretrace as ft
 from export_samples import write_data
 from factories import besides_doubt
 from foretrace import cli
-from foretrace.cli.futures import futures_content, prediction_band, radius_of, say_futures
+from foretrace.cli.futures import prediction_band, radius_of, say_futures
 from foretrace.errors import CheckpointError
 from foretrace.imagined import LEVELS, STARTS, conformal_scores
 from foretrace.interactions.dataset import Dataset
@@ -105,19 +105,19 @@ def test_nobody_says_more_than_is_known(capsys):
     say_futures(unsure)
     assert "not known" in capsys.readouterr().out
     assert radius_of(unsure) is None
-    assert futures_content(unsure)["futures"][0]["radius"] is None
+    assert unsure.to_dict()["futures"][0]["radius"] is None
     assert prediction_band(unsure).radius is None
     com = unsure.com_trajectory[None]
     single = replace(unsure, futures=Futures.point(com, None, "levered"))
     say_futures(single)
     assert capsys.readouterr() == ("", "")
-    assert futures_content(single) == {"warnings": []}
+    assert single.to_dict() == {"warnings": []}
 
 
 def test_futures_are_written_in_the_order_of_their_probability():
     effect = imagined_effect()
     order = replace(effect, futures=replace(effect.futures, probability=effect.futures.probability[:, ::-1]))
-    content = json.loads(json.dumps(futures_content(order)))
+    content = json.loads(json.dumps(order.to_dict()))
     assert [future["probability"] for future in content["futures"]] == [0.7, 0.25, 0.045, 0.005]
     assert content["futures"][0]["com_trajectory"] == effect.futures.com[0, 3].tolist()
     # No region holds what is hardly probable.

@@ -55,6 +55,7 @@ COMMANDS: dict[str, Entry] = {
     "capture": _command("capture:capture", "Record with a RealSense camera (experimental).", SEE),
     "overlay": _command("overlay:overlay", "Draw prediction and observation over a recording.", SEE),
     "export": Group("Write data for ROS, Rerun, LeRobot; predictors for ONNX.", EXPORTS, HAND_ON),
+    "serve": _command("studio:serve", "Serve predictions, plans and monitors over HTTP.", HAND_ON),
     "robot": _command("robot:robot", "Check and execute a lever-up on a UR10 (experimental).", HAND_ON),
 }
 """Every command by its name, in the order of the help."""

@@ -1,6 +1,6 @@
 """What a predictor says beside one motion: what else may happen, how sure it is, and what is unusual."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -90,26 +90,3 @@ def say_futures(imagined: "ImaginedEffect") -> None:
     radius = radius_of(imagined)
     told = "not known: the validation part was too small" if radius is None else f"{100 * radius[-1]:.2f} cm"
     print(f"radius of the {LEVEL:.0%} region at the end: {told}")
-
-
-def futures_content(imagined: "ImaginedEffect") -> dict[str, Any]:
-    """The same for ``trajectory.json``; futures are in the order of their probability, null where nothing is known."""
-    content: dict[str, Any] = {"warnings": list(imagined.warnings)}
-    futures = imagined.futures
-    if futures.is_point:
-        return content
-    radii = futures.radius(LEVEL)[0]
-    content["outcomes"] = {name: float(p[0]) for name, p in futures.outcomes().items()}
-    content["level"] = LEVEL
-    content["futures"] = [
-        {
-            "outcome": futures.outcome[k],
-            "probability": float(futures.probability[0, k]),
-            "com_trajectory": futures.com[0, k].tolist(),
-            "pose_trajectory": futures.pose[0, k].tolist(),
-            "radius": radii[k].tolist() if np.isfinite(radii[k]).all() else None,
-            "support_points": futures.support_points[0, k].tolist(),
-        }
-        for k in _in_order(futures)
-    ]
-    return content

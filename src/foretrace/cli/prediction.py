@@ -14,7 +14,7 @@ from foretrace.cli.batch import ManyOptions, predict_many
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.example import EXAMPLE, say_example, write_example
 from foretrace.cli.futures import (
-    futures_content,
+    LEVEL,
     other_motions,
     percentage,
     prediction_band,
@@ -271,7 +271,7 @@ def _write_trajectory(
     }
     if imagined.pose_trajectory is not None:
         content["pose_trajectory"] = imagined.pose_trajectory.tolist()
-    content |= futures_content(imagined)
+    content |= imagined.to_dict(LEVEL)
     if truth is not None:
         content["simulated"] = {
             "outcome": str(truth.effect.outcome),

@@ -39,6 +39,23 @@ def studio(
         served.stop()
 
 
+def serve(host: str = "127.0.0.1", port: int = 8000) -> None:
+    """Serve predictions, plans and monitors over HTTP. Needs foretrace[studio].
+
+    The page at / lists what can be asked, /openapi.json describes it. It asks for no password: by default nobody but
+    this machine reaches it.
+
+    Args:
+        host: Address to listen at; 0.0.0.0 lets other machines in, whoever they are.
+        port: Port to listen at; 0: any that is free.
+    """
+    require("fastapi", "uvicorn")
+    check_port(port)
+    from foretrace.studio.service import serve
+
+    serve(host, port)
+
+
 def require(*modules: str) -> None:
     """Make sure that optional libraries are there.
 

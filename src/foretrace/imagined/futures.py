@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -249,6 +249,36 @@ class ImaginedEffect:
     """What the imaginer was told beside the view, by name [SI]; NaN: not told."""
     worlds: "Worlds | None" = None
     """Motions in all worlds of a `Belief` that was averaged over; None: there was none."""
+
+    def to_dict(self, level: float = 0.9, most: int | None = None) -> dict[str, Any]:
+        """Warnings, outcomes and futures as plain values; of a point predictor, the warnings alone.
+
+        Futures are in the order of their probability, in the action frame [SI]; None where nothing is known.
+
+        Args:
+            level: Probability of the region whose radii are given.
+            most: Futures that are listed, at most; None: all.
+        """
+        content: dict[str, Any] = {"warnings": list(self.warnings)}
+        futures = self.futures
+        if futures.is_point:
+            return content
+        radii = futures.radius(level)[0]
+        order = np.argsort(-futures.probability[0], kind="stable")[:most]
+        content["outcomes"] = {name: float(p[0]) for name, p in futures.outcomes().items()}
+        content["level"] = level
+        content["futures"] = [
+            {
+                "outcome": futures.outcome[k],
+                "probability": float(futures.probability[0, k]),
+                "com_trajectory": futures.com[0, k].tolist(),
+                "pose_trajectory": futures.pose[0, k].tolist(),
+                "radius": radii[k].tolist() if np.isfinite(radii[k]).all() else None,
+                "support_points": futures.support_points[0, k].tolist(),
+            }
+            for k in order.tolist()
+        ]
+        return content
 
     def object_poses(self, T_action_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "time 7"] | None:
         """Poses of the object's frame in the action frame over time: position [m], quaternion (w, x, y, z).
