@@ -18,6 +18,7 @@ class Visitor:
     def __init__(self, address: str, link: str = "") -> None:
         self.controls: dict[str, dict[str, Any]] = {}
         self.nodes: dict[str, dict[str, Any]] = {}
+        self.downloads: list[str] = []
         self.owner = ""
         protocols = [f"viser-v{viser.__version__}"]
         self._open = ExitStack()
@@ -86,6 +87,11 @@ class Visitor:
     def html(self) -> str:
         return next(each["content"] for each in self.controls.values() if each["type"] == "GuiHtmlMessage")
 
+    @property
+    def verdict(self) -> str:
+        """What the monitor says."""
+        return [each["content"] for each in self.controls.values() if each["type"] == "GuiHtmlMessage"][1]
+
     def texts(self) -> str:
         """All Markdown of the page."""
         return "\n".join(str(each["_markdown"]) for each in self.controls.values() if "_markdown" in each)
@@ -104,6 +110,8 @@ class Visitor:
         if kind == "GuiUpdateMessage":
             if message["uuid"] in self.controls:
                 self.controls[message["uuid"]].update(message["updates"])
+        elif kind == "FileTransferStartDownload":
+            self.downloads.append(message["filename"])
         elif kind == "GuiRemoveMessage":
             self.controls.pop(message["uuid"], None)
         elif kind.startswith("Gui") and "uuid" in message and "props" in message:

@@ -17,10 +17,12 @@ import foretrace as ft
 from export_samples import write_data
 from factories import besides_doubt
 from foretrace import cli
-from foretrace.cli.futures import prediction_band, radius_of, say_futures
+from foretrace.cli.futures import say_futures
 from foretrace.errors import CheckpointError
 from foretrace.imagined import LEVELS, STARTS, conformal_scores
+from foretrace.imagined.shown import radius_of
 from foretrace.interactions.dataset import Dataset
+from foretrace.pictures.prediction import prediction_band
 from foretrace.pictures.scene import Scene, legend_of, scene_figure
 from foretrace.predictor import (
     Futures,

@@ -458,6 +458,7 @@ def planned(goal, imaginer=None, context=None, **settings):
     ("make", "error", "message"),
     [
         (lambda: planned(goals.Lift), TypeError, "give a goal such as"),
+        (lambda: ft.plan(ft.Box(0.01, 0.001, 0.02), goals.Lift()), PredictionError, "mask is empty"),
         (lambda: ft.plan(EMPTY, goals.Lift()), PredictionError, "mask is empty"),
         (
             lambda: planned(goals.Lift(), Lever(outcomes=("levered",))),

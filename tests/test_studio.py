@@ -11,10 +11,13 @@ import foretrace as ft
 from foretrace import cli
 from foretrace.errors import ForetraceError
 from foretrace.geometry import transform_points
+from foretrace.studio import saving
 from foretrace.studio.choices import Choices, link_of
+from foretrace.studio.controls import verdict_html
 from foretrace.studio.scenery import edges_of, futures_of, observed_motion, rim_segments, shown_times, tube
 from foretrace.studio.session import LEVEL, Session
 from foretrace.studio.shapes import EXAMPLES, example, from_file, from_text, prism_of
+from foretrace.studio.watching import WISHES
 
 TRIANGLE = "0 0\n0.12 0\n0.05 0.1\n"
 
@@ -28,7 +31,7 @@ def png(mask: np.ndarray) -> bytes:
 SQUARE = png(np.pad(np.full((100, 120), 255, np.uint8), 30))
 
 REFUSED = {
-    "turn is 0.7: give a number from -0.6 to 0.6": lambda: Choices(turn=0.7),
+    "turn is 0.7: give a number from -0.6109 to 0.6109": lambda: Choices(turn=0.7),
     "along is nan: give a number": lambda: Choices(along=np.nan),
     "friction is 3: give a number from 0.5 to 1.1": lambda: Choices(friction=3),
     "density is 'heavy'": lambda: Choices(density="heavy"),
@@ -57,6 +60,10 @@ REFUSED = {
     "mask.png": lambda: from_file("mask.png", b"no picture", scale=0.001),
     "large.stl has 9.0 MB": lambda: from_file("large.stl", bytes(9 << 20)),
     "part.stl": lambda: from_file("../../part.stl", b"solid nothing"),
+    "'rain' cannot go wrong: choose from surprise me": lambda: Session().watch("rain"),
+    "a cylinder cannot have an other shape": lambda: Session(
+        Choices(object=ft.Cylinder(0.03, 0.1), along=0.3)
+    ).watch("other shape"),
     "the contact (x, y) [m]": lambda: Session().move_to(np.array([np.nan, 0.0])),
 }
 
@@ -161,6 +168,52 @@ def test_errors_are_kept_until_something_else_is_chosen():
     assert session.imagined.times[0] == 0
 
 
+@pytest.mark.parametrize("wish", ["surprise me", "nothing", "slip", "freeze"])
+def test_a_monitor_watches_what_goes_wrong(wish):
+    session = Session(seed=WISHES.index(wish))
+    watched = session.watch(wish)
+    assert session.watched is watched
+    assert len(watched.verdicts) == len(watched.times) == len(watched.poses)
+    assert (watched.fault == "") == (wish == "nothing")
+    if wish in ("freeze", "slip"):
+        assert watched.alarm is not None
+        assert watched.truth.startswith(wish)
+    shown = verdict_html(watched, len(watched.times) - 1)
+    assert "In truth" in shown
+    assert "In truth" not in verdict_html(watched, 3)
+    assert ("alarm at" in shown) == (watched.alarm is not None)
+    session.change(along=0.4)
+    assert session.watched is None
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        Choices(along=0.3, turn=0.1, friction=None, goal="move", heading=0.5),
+        Choices(
+            object=example("box"), goal="tilt", exact=False, density=None, tool_friction=None, friction=None
+        ),
+        Choices(imaginer="twin", goal="turn-over"),
+    ],
+)
+def test_the_python_lines_do_the_same(choices):
+    session = Session(choices)
+    names: dict = {}
+    lines = saving.python_lines(session)
+    exec(compile(lines.split("plan = ")[0], "lines", "exec"), names)
+    np.testing.assert_allclose(names["imagined"].com_trajectory, session.imagined.com_trajectory, atol=1e-6)
+    goal = lines.split("ft.plan(obj, ")[1].split(", context")[0]
+    assert eval(goal, names) == session.choices.wanted
+    compile(lines, "lines", "exec")
+
+
+def test_pictures_and_plans_are_saved():
+    session = Session()
+    with pytest.raises(ForetraceError, match="press plan first"):
+        saving.plan_file(session.plan)
+    assert saving.picture(session, session.simulate().interaction)[:4] == b"\x89PNG"
+
+
 # --- what is drawn -----------------------------------------------------------------------------------------
 
 
@@ -175,7 +228,8 @@ def test_motions_are_drawn_in_the_objects_frame():
     np.testing.assert_allclose(carried, futures[0].path[-1], atol=1e-6)
     assert futures[0].probability == imagined.futures.probability.max()
     assert len(futures[0].path) == len(shown_times(imagined, action)) < len(imagined.times)
-    seen = observed_motion(session.simulate().interaction.effect, action)
+    seen = observed_motion(session.simulate().interaction.effect.pose_trajectory, action, com)
+    np.testing.assert_allclose(seen.path[0], com, atol=2e-3)
     np.testing.assert_allclose(seen.poses[0], np.eye(4), atol=2e-3)
     assert np.linalg.norm(seen.path[-1] - futures[0].path[-1]) < 0.01
 
@@ -274,6 +328,19 @@ def test_a_visitor_plans_and_simulates(served):
         place = visitor.value("place")
         visitor.set("look at", "alternative 2")
         visitor.look(lambda: visitor.value("place") != place)
+
+
+def test_a_visitor_watches_and_saves(served):
+    with visit(served) as visitor:
+        visitor.set("what goes wrong", "freeze")
+        visitor.click("watch")
+        visitor.look(lambda: "score" in visitor.verdict, 20)
+        visitor.set("time [s]", visitor.controls[visitor.find("time [s]")]["max"])
+        visitor.look(lambda: "tracker frozen" in visitor.verdict)
+        visitor.click("the same in Python")
+        visitor.look(lambda: "foretrace_lines.py" in visitor.downloads)
+        visitor.set("goal", "move")
+        visitor.look(lambda: "goal:move" in visitor.value("link"))
 
 
 def test_a_link_that_cannot_be_read_is_told(served):

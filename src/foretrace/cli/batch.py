@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from foretrace.cli.contact import ContactOptions
-from foretrace.cli.futures import LEVEL
 from foretrace.cli.objects import ObjectOptions
 from foretrace.errors import ForetraceError, PredictionError
+from foretrace.imagined.shown import LEVEL
 
 if TYPE_CHECKING:
     from foretrace.actions import LeverUp, ToolPath

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from tyro.conf import Positional
 
-from foretrace.cli.futures import radius_of
 from foretrace.errors import DatasetError, PerceptionError
 from foretrace.experiments.transfer_figures import side_figure
 from foretrace.geometry import pose_to_matrix, transform_points
 from foretrace.imagined import ImaginedEffect
+from foretrace.imagined.shown import radius_of
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.pinhole import PinholeCamera
 from foretrace.interactions.record import Interaction

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
-from foretrace.cli.futures import radius_of
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PlanningError
+from foretrace.imagined.shown import radius_of
 from foretrace.perception.photo import PhotoConfig
 from foretrace.planning import PlanConfig, goals
 

@@ -13,18 +13,12 @@ from foretrace.actions import ToolPath
 from foretrace.cli.batch import ManyOptions, predict_many
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.example import EXAMPLE, say_example, write_example
-from foretrace.cli.futures import (
-    LEVEL,
-    other_motions,
-    percentage,
-    prediction_band,
-    radius_of,
-    say_futures,
-)
+from foretrace.cli.futures import say_futures
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
 from foretrace.imagined.context import CONSTANTS, CONTEXT, EXACT, PARAMETERS, nominal_constants
+from foretrace.imagined.shown import LEVEL, radius_of
 from foretrace.perception.photo import PhotoConfig
 
 if TYPE_CHECKING:
@@ -33,7 +27,6 @@ if TYPE_CHECKING:
     from foretrace.interactions.record import Interaction
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import ObjectModel
-    from foretrace.pictures.scene import Scene
 
 
 def _named(name: str) -> str:
@@ -121,7 +114,7 @@ def predict(
     say_futures(imagined)
     out.mkdir(parents=True, exist_ok=True)
     _write_trajectory(out, run, object, action, imagined, truth)
-    _draw(out, scene_of(object, action, imagined, predictor.display_name, truth), animation)
+    _draw(out, object, action, imagined, predictor.display_name, truth, animation)
     if seen is not None:
         from foretrace.interactions.recording_folder import write_image
 
@@ -133,46 +126,20 @@ def predict(
         say_example(out / EXAMPLE)
 
 
-def scene_of(
+def _draw(
+    out: Path,
     obj: "ObjectModel",
     action: "LeverUp",
     imagined: "ImaginedEffect",
     name: str,
-    truth: "Interaction | None" = None,
-) -> "Scene":
-    """What pictures show of a prediction: the most probable motion and the others; or, if it is known, the truth.
-
-    Args:
-        obj: The object.
-        action: The action.
-        imagined: What is predicted; samples after the action's end are left out.
-        name: What the predictor is called.
-        truth: The simulated lever-up.
-    """
-    from foretrace.pictures.scene import Ghost, Scene
-    from foretrace.pictures.style import PREDICTION_COLORS
-
-    imagined = imagined.until(action.duration)
-    placement, color = action.T_action_object, PREDICTION_COLORS[0]
-    pose, paths = imagined.object_poses(placement), {name: imagined.com_trajectory}
-    if truth is not None and len(truth.effect.times) > 0:
-        scene = replace(
-            Scene.observed(truth, paths), title=f"Predicted and simulated lever-up: {truth.effect.outcome}"
-        )
-        ghosts = [] if pose is None else [Ghost(pose, color, 1)]
-    else:
-        scene = Scene.imagined(obj, action, imagined.times, paths, pose)
-        if not imagined.futures.is_point:
-            outcome, chance = max(imagined.futures.outcomes().items(), key=lambda item: item[1][0])
-            scene = replace(scene, title=f"{scene.title}: {outcome} {percentage(float(chance[0]))}")
-        ghosts = [Ghost(motion, color, 1) for motion in other_motions(imagined, placement)]
-    return replace(scene, band=prediction_band(imagined), ghosts=ghosts)
-
-
-def _draw(out: Path, scene: "Scene", animation: bool) -> None:
+    truth: "Interaction | None",
+    animation: bool,
+) -> None:
     from foretrace.pictures.animation import scene_animation
+    from foretrace.pictures.prediction import scene_of
     from foretrace.pictures.scene import scene_figure
 
+    scene = scene_of(obj, action, imagined, name, truth)
     scene_figure(scene).savefig(out / "prediction.png")
     if animation:
         scene_animation(scene, out / "prediction.gif")

@@ -107,7 +107,7 @@ def make_execution(seed: int, number: int, fault: str = "") -> Execution:
             continue
         scene = Scene(varied, physics, action, offset)
         normal = scene.play()
-        changed = _changed(scene, fault, rng)
+        changed = with_fault(scene, fault, rng)
         poses = normal if changed is scene else changed.play()
         if normal is None or poses is None:
             continue
@@ -194,8 +194,14 @@ class Scene:
         return withdrawn
 
 
-def _changed(scene: Scene, fault: str, rng: np.random.Generator) -> Scene:
-    """The scene with what goes wrong."""
+def with_fault(scene: Scene, fault: str, rng: np.random.Generator) -> Scene:
+    """The scene with what goes wrong.
+
+    Args:
+        scene: The scene; for the fault ``other shape``, of a prism.
+        fault: One of FAULTS, or empty.
+        rng: Random numbers.
+    """
     angle = rng.uniform(0, 2 * np.pi)
     way = np.array([np.cos(angle), np.sin(angle)])
     if fault == "slip":

@@ -60,6 +60,7 @@ class Scene:
         middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
         action = LeverUp(middle - np.array([LOOK_AHEAD, 0.0]), (1.0, 0.0))
         view = TopDownView.of(seen, action)
+        check_object(view.mask, view.height)  # a needle is seen in no pixel
         com = seen.mass_properties(1.0).com
         return cls(view, action.T_action_object, corners, seen.height, com, seen)
 

@@ -14,10 +14,12 @@ from foretrace.objects.prism import DEFAULT_HEIGHT
 from foretrace.planning import PlanConfig, goals
 from foretrace.studio.shapes import MOST_CORNERS, prism_of
 
-Point = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+Number = Annotated[FiniteFloat, Field(ge=-1e6, le=1e6)]
+"""Anything in SI units: larger numbers are mistakes, and overflow when they are squared."""
+Point = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Pose = Annotated[list[float], Field(min_length=7, max_length=7)]
 Matrix = Annotated[
-    list[Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
+    list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
 ]
 ConstantName = Literal["friction", "tool_friction", "density", "contact_error"]
 GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "slide-off"]
@@ -36,7 +38,7 @@ class PrismBody(_Body):
     kind: Literal["prism"]
     corners: Annotated[list[Point], Field(min_length=3, max_length=MOST_CORNERS)]
     """Corners of the outline in the object's frame [m]."""
-    height: FiniteFloat = DEFAULT_HEIGHT
+    height: Number = DEFAULT_HEIGHT
     """Height [m]."""
     bevel: Point | None = None
     """Width and height of the chamfer at its lower rim [m]; by default one that fits."""
@@ -53,11 +55,11 @@ class BoxBody(_Body):
     """A box."""
 
     kind: Literal["box"]
-    length: FiniteFloat
+    length: Number
     """Along x [m]."""
-    width: FiniteFloat
+    width: Number
     """Along y [m]."""
-    height: FiniteFloat
+    height: Number
     """Height [m]."""
 
     def make(self) -> ObjectModel:
@@ -69,9 +71,9 @@ class CylinderBody(_Body):
     """A cylinder that lies on its side."""
 
     kind: Literal["cylinder"]
-    radius: FiniteFloat
+    radius: Number
     """Radius [m]."""
-    length: FiniteFloat
+    length: Number
     """Length [m]."""
 
     def make(self) -> ObjectModel:
@@ -89,13 +91,13 @@ class ActionBody(_Body):
     """Point of the outline where the blade meets it, in the object's frame [m]."""
     direction: Point | None = None
     """Direction of the action there; by default the inward normal at the nearest point of the outline."""
-    insertion: FiniteFloat = ToolPath.insertion
+    insertion: Number = ToolPath.insertion
     """Distance that the blade is pushed under the object [m]."""
-    arc_radius: FiniteFloat = ToolPath.arc_radius
+    arc_radius: Number = ToolPath.arc_radius
     """Radius of the arc on which it lifts [m]."""
-    sweep: FiniteFloat = ToolPath.sweep
+    sweep: Number = ToolPath.sweep
     """Angle of that arc [rad]."""
-    speed: FiniteFloat = 1.0
+    speed: Number = 1.0
     """Speed, as a multiple of the nominal one."""
 
     def make(self, obj: ObjectModel) -> LeverUp:
@@ -108,7 +110,7 @@ class ActionBody(_Body):
         return action
 
 
-ContextBody = dict[ConstantName, FiniteFloat] | Literal["unknown"] | None
+ContextBody = dict[ConstantName, Number] | Literal["unknown"] | None
 
 
 class Known(_Body):
@@ -133,14 +135,14 @@ class GoalBody(_Body):
     """What is to happen, in the object's frame; each goal has entries of its own, those of its class in `ft.goals`."""
 
     name: GoalName
-    max_slip: FiniteFloat | None = None
-    at_least: FiniteFloat | None = None
-    angle: FiniteFloat | None = None
+    max_slip: Number | None = None
+    at_least: Number | None = None
+    angle: Number | None = None
     edge: int | None = None
     direction: Point | None = None
     position: Point | None = None
-    turn: FiniteFloat | None = None
-    tolerance: FiniteFloat | None = None
+    turn: Number | None = None
+    tolerance: Number | None = None
     point: Point | None = None
     outward: Point | None = None
 
@@ -190,13 +192,13 @@ class MonitorBody(Known):
     action: ActionBody
     worlds: Annotated[int, Field(ge=0, le=256)] = 128
     """Worlds of a belief over friction, density and execution error; 0: what is predicted in the context alone."""
-    false_alarms: FiniteFloat = 0.05
+    false_alarms: Number = 0.05
     """Share of whole normal executions that alarm, at most."""
-    rest: Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)] | None = None
+    rest: Annotated[list[Number], Field(min_length=7, max_length=7)] | None = None
     """Pose of the object's frame at rest, where it is known."""
     T_table_action: Matrix | None = None
     """The action frame in the table frame, where poses are tracked in the table frame."""
-    clock_error: FiniteFloat = 0.0
+    clock_error: Number = 0.0
     """Largest error of the tracker's clock [s]."""
 
 

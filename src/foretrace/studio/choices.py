@@ -15,7 +15,7 @@ from foretrace.objects import Bevel, ObjectModel, Prism
 from foretrace.planning import goals
 from foretrace.studio.shapes import EXAMPLES, checked, example
 
-LARGEST_TURN = 0.6
+LARGEST_TURN = float(np.deg2rad(35.0))
 """Largest angle of the direction to the inward normal [rad]."""
 PHYSICS = ("friction", "tool_friction", "density")
 """Constants that may be unknown."""

@@ -12,9 +12,12 @@ from foretrace.pictures.style import GREY, OUTCOME_COLORS, PREDICTION_COLORS
 from foretrace.studio.choices import LIMITS, PHYSICS, Choices, GoalName
 from foretrace.studio.session import LEVEL
 from foretrace.studio.shapes import EXAMPLES
+from foretrace.studio.watching import SURPRISE, WISHES, Watched
 
 OWN = "your own"
 """What the list of examples says of an object that is none of them."""
+LEAST_SHOWN = 5e-4
+"""Outcomes less probable than this are not listed."""
 DEGREE = float(np.pi / 180)
 
 
@@ -132,7 +135,10 @@ class Controls:
             self._add_object(choices, data)
         with tabs.add_tab("Plan"):
             self._add_goal(choices)
-        self.tabs = tabs
+        with tabs.add_tab("Watch"):
+            self._add_watch()
+        with tabs.add_tab("Save"):
+            self._add_save()
         self.show_goal(choices.goal)
 
     def _slider(self, name: str) -> None:
@@ -201,6 +207,21 @@ class Controls:
         self.planned = gui.add_markdown("")
         self.alternatives = gui.add_dropdown("look at", ("-",), visible=False)
 
+    def _add_watch(self) -> None:
+        gui = self._gui
+        gui.add_markdown("A monitor watches a simulated execution in which something goes wrong.")
+        self.wish = gui.add_dropdown("what goes wrong", WISHES, initial_value=SURPRISE)
+        self.watch = gui.add_button("watch", color="green")
+        self.verdict = gui.add_html("")
+
+    def _add_save(self) -> None:
+        gui = self._gui
+        self.save_picture = gui.add_button("picture (PNG)")
+        self.save_animation = gui.add_button("animation (GIF)")
+        self.save_plan = gui.add_button("plan.json")
+        self.save_lines = gui.add_button("the same in Python")
+        self.link = gui.add_text("link", "", hint="Opens this page with these choices.")
+
     # --- what they show ----------------------------------------------------------------------------------
 
     def show_goal(self, goal: str) -> None:
@@ -216,6 +237,10 @@ class Controls:
         self.example.value = next((name for name, each in EXAMPLES.items() if each is choices.object), OWN)
         self.show_goal(choices.goal)
 
+    def show_verdict(self, watched: Watched | None, k: int) -> None:
+        """What the monitor said up to a sample; nothing where nothing is watched."""
+        self.verdict.content = "" if watched is None else verdict_html(watched, k)
+
     def show_result(self, imagined: ImaginedEffect | None, message: str = "") -> None:
         """Outcomes with their probabilities, and a message."""
         self.result.content = result_html(imagined, message)
@@ -228,6 +253,8 @@ def result_html(imagined: ImaginedEffect | None, message: str = "") -> str:
         chances = sorted(imagined.futures.outcomes().items(), key=lambda item: -item[1][0])
         for name, chance in chances[:3]:
             share, colour = float(chance[0]), OUTCOME_COLORS.get(name, GREY)
+            if share < LEAST_SHOWN:
+                continue
             rows.append(
                 f'<div style="display:flex;align-items:center;gap:0.5em;line-height:1.35">'
                 f'<span style="width:5.2em">{escape(name)}</span>'
@@ -247,3 +274,44 @@ def result_html(imagined: ImaginedEffect | None, message: str = "") -> str:
 
 def _note(text: str) -> str:
     return f'<div style="color:{PREDICTION_COLORS[0]};line-height:1.25;margin-top:0.3em">{escape(text)}</div>'
+
+
+def verdict_html(watched: Watched, k: int) -> str:
+    """Score, threshold, alarm and cause up to a sample, in HTML; in the end, what went wrong."""
+    verdicts = watched.verdicts[: k + 1]
+    last, end = verdicts[-1], float(watched.times[-1])
+    low, high = np.log(0.05), np.log(max(20.0, 1.2 * max(each.score for each in watched.verdicts)))
+
+    def place(time: float, score: float) -> str:
+        y = (np.log(max(score, 0.05)) - low) / (high - low)
+        return f"{300 * time / end:.1f},{100 - 100 * float(y):.1f}"
+
+    limit = float(place(0.0, last.threshold).split(",")[1])
+    curve = " ".join(place(each.time, each.score) for each in verdicts)
+    alarm = next((each for each in verdicts if each.alarm), None)
+    red = PREDICTION_COLORS[0]
+    mark = (
+        ""
+        if alarm is None
+        else f'<path d="M{300 * alarm.time / end:.1f} 0v100" stroke="{red}" stroke-width="1"/>'
+    )
+    chart = (
+        f'<svg viewBox="0 0 300 100" style="width:100%;height:110px;background:rgba(128,128,128,.12)">'
+        f'<path d="M0 {limit:.1f}h300" stroke="currentColor" stroke-dasharray="5 4" stroke-width="1"/>{mark}'
+        f'<polyline points="{curve}" fill="none" stroke="{red}" stroke-width="2"/></svg>'
+    )
+    rows = [
+        f"<div>score {last.score:.2f}, alarm above {last.threshold:.2f} (dashed; logarithmic)</div>",
+        "<div>" + ", ".join(f"{escape(n)} {p:.0%}" for n, p in last.outcomes.items() if p > 0.01) + "</div>",
+    ]
+    if alarm is None:
+        rows.append(f"<div><b>{escape(last.message)}</b></div>")
+    else:
+        causes = ", ".join(f"{escape(name)} {p:.0%}" for name, p in last.causes.items() if p > 0.05)
+        cause = escape(str(last.cause))
+        rows.append(
+            f'<div style="color:{red}"><b>alarm at {alarm.time:.2f} s: {cause}</b></div><div>{causes}</div>'
+        )
+    if k >= len(watched.times) - 1:
+        rows.append(f"<div>In truth: <b>{escape(watched.truth)}</b></div>")
+    return f'<div style="padding:0.4em 1em;font-size:0.82em;line-height:1.5">{chart}{"".join(rows)}</div>'

@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, StudioError
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.record import Interaction
 from foretrace.planning import Plan
-from foretrace.studio.choices import Choices
+from foretrace.studio.choices import LARGEST_TURN, Choices, link_of
 from foretrace.studio.controls import OWN, Controls
-from foretrace.studio.scenery import futures_of, observed_motion, shown_times
-from foretrace.studio.session import LEVEL, Session, Simulated
+from foretrace.studio.saving import animation, picture, plan_file, python_lines
+from foretrace.studio.scenery import Moving, futures_of, observed_motion, shown_times
+from foretrace.studio.session import LEVEL, Session
 from foretrace.studio.shapes import MOST_CORNERS, checked, example, from_file, from_text, prism_of
 from foretrace.studio.stage import Stage
 
@@ -33,19 +36,22 @@ class Page:
         choices: What is chosen at first.
         data: Data set that objects can be taken from.
         message: What the visitor is told at first.
+        address: Host and port by which the visitor came, for links.
     """
 
-    def __init__(self, client: Any, choices: Choices, data: Dataset | None = None, message: str = "") -> None:
+    def __init__(
+        self, client: Any, choices: Choices, data: Dataset | None = None, message: str = "", address: str = ""
+    ) -> None:
         self.session = Session(choices)
         """What is chosen, and what follows."""
         self.latencies: list[float] = []
         """Seconds from each of the last events to its picture."""
-        self._client, self._data = client, data
+        self._client, self._data, self._address = client, data, address
         self._lock, self._numbers, self._latest = RLock(), count(1), 0
         self._closed = Event()
         self._drawn: list[np.ndarray] | None = None
         self._dragged: tuple[np.ndarray, bool] | None = None
-        self._simulated: Simulated | None = None
+        self._told = -1
         self._message = ""
         self.stage = Stage(client)
         self.controls = Controls(client.gui, choices, self._choose, data is not None)
@@ -106,6 +112,14 @@ class Page:
         _on(controls.plan, lambda: self.act(self._plan))
         _on(controls.alternatives, lambda: self.act(self._look_at))
         _on(controls.simulate, lambda: self.act(self._simulate))
+        _on(controls.watch, lambda: self.act(self._watch))
+        for handle, name, make in (
+            (controls.save_picture, "foretrace.png", lambda: picture(self.session, self._truth)),
+            (controls.save_animation, "foretrace.gif", lambda: animation(self.session, self._truth)),
+            (controls.save_plan, "plan.json", lambda: plan_file(self.session.plan)),
+            (controls.save_lines, "foretrace_lines.py", lambda: python_lines(self.session).encode()),
+        ):
+            _on(handle, lambda name=name, make=make: self.act(lambda: self._save(name, make)))
         controls.upload.on_upload(lambda event: self.act(self._take_file))
         for handle in (self.stage.grip, *self.stage.parts):
             for modifier in (None, "shift"):
@@ -134,12 +148,11 @@ class Page:
             old = np.arctan2(action.direction[1], action.direction[0])
             change = np.arctan2(way[1], way[0]) - old
             turn = chosen.turn + (change + np.pi) % (2 * np.pi) - np.pi
-            self.session.change(turn=float(np.clip(turn, -0.6, 0.6)))
+            self.session.change(turn=float(np.clip(turn, -LARGEST_TURN, LARGEST_TURN)))
 
     def _take(self, obj: Any) -> None:
         """Another object."""
         self.session.change(object=obj, along=0.1, turn=0.0)
-        self._simulated = None
         self.stage.show_object(obj)
         middle = obj.corners.mean(axis=0)
         self._client.camera.look_at = (*middle.tolist(), 0.03)
@@ -208,7 +221,6 @@ class Page:
         except ForetraceError:
             self.controls.planned.content = ""
             raise
-        self._simulated = None
         self.controls.planned.content = plan_text(found)
         names = ["the best", *(f"alternative {k}" for k in range(2, len(found.alternatives) + 2))]
         self.controls.alternatives.options = tuple(names)
@@ -224,15 +236,25 @@ class Page:
         self.session.plan = found
 
     def _simulate(self) -> None:
-        self._simulated = self.session.simulate()
-        effect, tried = self._simulated.interaction.effect, self.session.simulations
-        drawn = ", ".join(
-            f"{name.replace('_', ' ')} {value:.3g}" for name, value in self._simulated.drawn.items()
-        )
-        text = f"**{effect.outcome}** in MuJoCo (green)"
+        simulated, tried = self.session.simulate(), self.session.simulations
+        drawn = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in simulated.drawn.items())
+        text = f"**{simulated.interaction.effect.outcome}** in MuJoCo (green)"
         if tried:
             text += f"; the {LEVEL:.0%} region held {sum(tried)} of {len(tried)}"
         self.controls.simulated.content = text + (f"\n\ndrawn: {drawn}" if drawn else "")
+
+    def _watch(self) -> None:
+        self.session.watch(self.controls.wish.value)
+        self.controls.play.value = True
+        self.controls.time.value = 0.0
+        self._told = -1
+
+    def _save(self, name: str, make: Callable[[], bytes]) -> None:
+        self._client.send_file_download(name, make())
+
+    @property
+    def _truth(self) -> Interaction | None:
+        return None if self.session.simulated is None else self.session.simulated.interaction
 
     # --- what the visitor sees ---------------------------------------------------------------------------
 
@@ -248,9 +270,6 @@ class Page:
         except ForetraceError as error:
             imagined = None
             self._message = self._message or str(error)
-        if not session.simulations and self._simulated is not None and self._simulated.held is not None:
-            self._simulated = None
-            controls.simulated.content = ""
         with self._client.atomic():
             controls.show_choices(session.choices)
             controls.show_result(imagined, self._message)
@@ -258,13 +277,32 @@ class Page:
             futures = [] if imagined is None else futures_of(imagined, action, LEVEL)
             stage.show_contact(action, times)
             stage.show_futures(futures, controls.tubes.value)
-            effect = None if self._simulated is None else self._simulated.interaction.effect
-            stage.show_other("simulated", None if effect is None else observed_motion(effect, action))
+            stage.show_other("simulated", self._happened(action))
+            controls.link.value = self._link()
             if not controls.twin.value:
                 stage.show_other("twin", None)
             if controls.time.max != (end := max(float(times[-1]), 0.05)):
                 controls.time.max = end
         stage.show_time(float(controls.time.value))
+
+    def _happened(self, action: LeverUp) -> Moving | None:
+        """What was simulated or watched last; texts about what no longer holds are removed."""
+        session = self.session
+        com = session.choices.object.mass_properties(1.0).com
+        if session.simulated is None:
+            self.controls.simulated.content = ""
+        if session.watched is not None:
+            return observed_motion(session.watched.poses, action, com)
+        self.controls.show_verdict(None, 0)
+        if session.simulated is None:
+            return None
+        return observed_motion(session.simulated.interaction.effect.pose_trajectory, action, com)
+
+    def _link(self) -> str:
+        try:
+            return link_of(self._address, self.session.choices)
+        except StudioError as error:
+            return str(error)
 
     def _draw_what_takes_time(self, number: int) -> None:
         """The twin's motion and the rim, unless the visitor has gone on meanwhile."""
@@ -297,6 +335,11 @@ class Page:
 
     def _show_time(self, time: float) -> None:
         self.stage.show_time(time)
+        if (watched := self.session.watched) is not None:
+            k = int(np.searchsorted(watched.times, time + 1e-6, side="right")) - 1
+            if k != self._told:
+                self._told = k
+                self.controls.show_verdict(watched, k)
 
     def _let_time_run(self) -> None:
         """While `play` is on, until the visitor goes."""
@@ -309,7 +352,7 @@ class Page:
             end = float(self.controls.time.max)
             now = 0.0 if now > end + PAUSE else now + elapsed
             self.controls.time.value = min(round(now / 0.05) * 0.05, end)
-            self.stage.show_time(min(now, end))
+            self._show_time(min(now, end))
 
 
 def plan_text(found: Plan) -> str:

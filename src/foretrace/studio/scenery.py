@@ -10,15 +10,10 @@ from jaxtyping import Float, Int
 from matplotlib import colormaps
 
 from foretrace.actions import LeverUp, tool_transforms
-from foretrace.geometry import (
-    invert_transform,
-    pose_to_matrix,
-    quaternion_to_matrix,
-    rotation_vector_to_quaternion,
-    transform_points,
-)
+from foretrace.geometry import invert_transform, pose_to_matrix, transform_points
 from foretrace.imagined import ImaginedEffect
-from foretrace.interactions.record import Effect
+from foretrace.imagined.futures import carried_poses
+from foretrace.imagined.shown import in_order
 from foretrace.objects import ObjectModel
 from foretrace.objects.surface import faces_of
 from foretrace.pictures.plan import COSTS
@@ -72,37 +67,41 @@ def futures_of(imagined: ImaginedEffect, action: LeverUp, level: float) -> list[
         action: The lever-up.
         level: Probability with which a motion stays in the region.
     """
-    futures, count = imagined.futures, len(shown_times(imagined, action))
-    radius = futures.radius(level)[0, :, :count]
-    order = np.argsort(-futures.probability[0], kind="stable")[:MOST_FUTURES]
-    shown = [k for k in order.tolist() if futures.probability[0, k] >= LEAST_PROBABLE or k == order[0]]
-    T_object_action = invert_transform(action.T_action_object)
+    imagined = imagined.until(action.duration)
+    futures, T_action_object = imagined.futures, action.T_action_object
+    T_object_action = invert_transform(T_action_object)
+    radius = futures.radius(level)[0]
+    order = in_order(futures)[:MOST_FUTURES]
     found = []
-    for k in shown:
-        states = futures.states[0, k, :count]
-        T = np.tile(np.eye(4), (count, 1, 1))
-        turned = np.nan_to_num(states[:, 3:])
-        T[:, :3, :3] = quaternion_to_matrix(rotation_vector_to_quaternion(turned))
-        T[:, :3, 3] = states[:, :3] - T[:, :3, :3] @ states[0, :3]
-        wide = radius[k] if np.isfinite(radius[k]).all() else None
+    for k in order:
+        if k != order[0] and futures.probability[0, k] < LEAST_PROBABLE:
+            continue
+        known = np.isfinite(radius[k]).all()
+        poses = carried_poses(futures.pose[0, k], T_action_object)
         found.append(
             Moving(
                 futures.outcome[k],
                 float(futures.probability[0, k]),
-                T_object_action @ T @ action.T_action_object,
-                transform_points(T_object_action, states[:, :3]),
-                None if wide is None else np.minimum(wide, LARGEST_RADIUS),
+                T_object_action @ pose_to_matrix(poses),
+                transform_points(T_object_action, futures.com[0, k]),
+                np.minimum(radius[k], LARGEST_RADIUS) if known else None,
             )
         )
     return found
 
 
-def observed_motion(effect: Effect, action: LeverUp) -> Moving:
-    """A motion that was simulated or recorded."""
-    T_object_action = invert_transform(action.T_action_object)
-    poses = T_object_action @ pose_to_matrix(effect.pose_trajectory)
-    path = transform_points(T_object_action, effect.com_trajectory)
-    return Moving(effect.outcome, 1.0, poses, path)
+def observed_motion(
+    poses: Float[np.ndarray, "time 7"], action: LeverUp, com: Float[np.ndarray, "3"]
+) -> Moving:
+    """A motion that was simulated or recorded.
+
+    Args:
+        poses: Poses of the object's frame in the action frame.
+        action: The lever-up.
+        com: Centre of mass at rest, in the object's frame [m].
+    """
+    T_rest_now = invert_transform(action.T_action_object) @ pose_to_matrix(poses)
+    return Moving("", 1.0, T_rest_now, T_rest_now[:, :3, :3] @ com + T_rest_now[:, :3, 3])
 
 
 def tool_poses_of(action: LeverUp, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4 4"]:

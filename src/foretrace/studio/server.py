@@ -82,19 +82,22 @@ class StudioServer:
                 client.gui.add_markdown(f"There are {MOST_VISITORS} visitors already: come back later.")
                 return
             choices, message = self._first, ""
+            text, address = self._asked(client)
             try:
-                choices = Choices.from_text(text) if (text := self._link(client)) else self._first
+                choices = Choices.from_text(text) if text else self._first
             except ForetraceError as error:
                 message = str(error)
-            self.pages[client.client_id] = Page(client, choices, self._data, message)
+            self.pages[client.client_id] = Page(client, choices, self._data, message, address)
 
     def _go(self, client: Any) -> None:
         with self._lock:
             if (page := self.pages.pop(client.client_id, None)) is not None:
                 page.close()
 
-    def _link(self, client: Any) -> str:
-        """What the visitor's link says of the choices; viser keeps the request to itself."""
+    def _asked(self, client: Any) -> tuple[str, str]:
+        """What the visitor's link says of the choices, and the address that it goes to; viser keeps both to itself."""
         connections = getattr(self._server._websock_server, "_live_connections", {})
         request = getattr(connections.get(client.client_id), "request", None)
-        return "" if request is None else request.path.lstrip("/")
+        if request is None:
+            return "", self.address
+        return request.path.lstrip("/"), request.headers.get("Host", self.address)

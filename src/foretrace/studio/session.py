@@ -20,12 +20,15 @@ from foretrace.planning import Plan, PlanConfig, RimCost, plan
 from foretrace.planning.candidates import Rim, place
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.studio.choices import LARGEST_TURN, PHYSICS, Choices
+from foretrace.studio.watching import SURPRISE, Watched, watch
 from foretrace.twin import TwinConfig, TwinImaginer
 
 LEVEL = 0.9
 """Probability with which a motion stays in the region that is drawn."""
 TWIN = TwinConfig(worlds=8, workers=1)
 """A few worlds in this process: a visitor waits for it, and others do meanwhile."""
+WORLDS = 128
+"""Worlds of a belief that a monitor compares an execution with."""
 LOOK_AROUND = PlanConfig(refine=0, check=0)
 """What colours the rim: the first stage of a plan alone."""
 
@@ -61,6 +64,10 @@ class Session:
         """What is chosen."""
         self.simulations: list[bool] = []
         """Of the simulations with the present choices, whether the region held the motion."""
+        self.simulated: Simulated | None = None
+        """The last of them."""
+        self.watched: Watched | None = None
+        """The last execution that was watched; or None, if one was simulated after it."""
         self.plan: Plan | None = None
         """The last plan for this object and goal."""
         self._rng = np.random.default_rng(seed)
@@ -77,7 +84,7 @@ class Session:
         before, self.choices = self.choices, self.choices.changed(**changes)
         kept = ("goal", "angle", "heading", "distance")
         if any(getattr(before, name) != getattr(self.choices, name) for name in changes if name not in kept):
-            self.simulations = []
+            self.simulations, self.simulated, self.watched = [], None, None
             self._known = {name: each for name, each in self._known.items() if name == "rim"}
         if any(name not in ("along", "turn", "imaginer") for name in changes):
             self._known.pop("rim", None)
@@ -163,7 +170,23 @@ class Session:
         held = self._holds(interaction)
         if held is not None:
             self.simulations.append(held)
-        return Simulated(interaction, held, drawn)
+        self.simulated, self.watched = Simulated(interaction, held, drawn), None
+        return self.simulated
+
+    def watch(self, wish: str = SURPRISE) -> Watched:
+        """Simulate an execution in which something goes wrong, watched by a monitor with a belief over the physics.
+
+        Args:
+            wish: What is to go wrong, one of `foretrace.studio.watching.WISHES`.
+
+        Raises:
+            ForetraceError: The lever-up cannot be imagined or simulated, or there is no such fault.
+        """
+        imagined = self._once("believed", lambda: self._imagine(learned(), Belief(worlds=WORLDS)))
+        physics, offset, _ = self.draw()
+        self.watched = watch(self.choices.object, self.action, imagined, (physics, offset), wish, self._rng)
+        self.simulated = None
+        return self.watched
 
     def draw(self) -> tuple[Physics, ExecutionOffset, dict[str, float]]:
         """Constants and execution error of one world, and those of them that were unknown by name."""
@@ -196,11 +219,12 @@ class Session:
         obj = self.choices.object
         return TwinImaginer(config=TWIN, object=None if type(obj) is Prism else obj)
 
-    def _imagine(self, imaginer: Imaginer) -> ImaginedEffect:
+    def _imagine(self, imaginer: Imaginer, belief: Belief | None = None) -> ImaginedEffect:
         action, obj = self.action, self.choices.object
         com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
         view = TopDownView.of(obj, action)
-        return imaginer.imagine(view, action, context=self._told(imaginer), com=com)
+        told = self._told(imaginer) if belief is None else belief
+        return imaginer.imagine(view, action, context=told, com=com)
 
     def _told(self, imaginer: Imaginer) -> dict[str, float]:
         return {name: value for name, value in self.choices.context.items() if name in imaginer.context}

@@ -29,15 +29,19 @@ from foretrace.studio.scenery import (
 )
 
 OBJECT = (158, 186, 214)
-TABLE = (226, 224, 219)
+TABLE = (188, 192, 198)
 GRIP = (240, 120, 20)
 TWIN = (150, 90, 170)
 GRIP_BEHIND, GRIP_RADIUS = 0.05, 0.007
 """The grip lies so far behind the contact; its radius [m]."""
-CAMERA, LOOK_AT = (0.13, -0.4, 0.26), (0.0, 0.0, 0.03)
+CAMERA, LOOK_AT = (0.14, -0.3, 0.22), (0.0, 0.0, 0.02)
 """Where the camera is at first, and what it looks at [m]."""
 TABLE_SIZE = (0.9, 0.9, 0.012)
 """The table [m]."""
+RIM = 0.006
+"""Thickness of the coloured rim [m]."""
+SHRUNK = 0.985
+"""Ghosts are that much smaller, so that they are hidden in the object where they do not differ from it."""
 LINE = 0.0009
 """Thickness of lines [m]."""
 
@@ -70,8 +74,8 @@ class Stage:
             "/table", dimensions=(x, y, z), position=(0, 0, -z / 2), color=TABLE, cast_shadow=False
         )
         self._scene.add_grid(
-            "/grid", width=x, height=y, cell_size=0.01, section_size=0.1, cell_color=(205, 203, 198),
-            section_color=(180, 178, 172), cell_thickness=0.6, position=(0, 0, 0.0003), shadow_opacity=0.0,
+            "/grid", width=x, height=y, cell_size=0.01, section_size=0.1, cell_color=(178, 182, 188),
+            section_color=(160, 165, 172), cell_thickness=0.6, position=(0, 0, 0.0003), shadow_opacity=0.0,
         )  # fmt: skip
         self.tool = self._scene.add_frame("/tool", show_axes=False)
         self.parts: list[Any] = []
@@ -110,6 +114,8 @@ class Stage:
         edges, edge_colour = edges_of(obj), colour_of(OBJECT_EDGE)
         if len(edges):
             self._scene.add_line_segments("/object/edges", edges, edge_colour, thickness=LINE)
+        middle = vertices.mean(axis=0)
+        look["vertices"] = middle + SHRUNK * (vertices - middle)
         closed = np.stack([obj.corners, np.roll(obj.corners, -1, axis=0)], axis=1)
         rest = np.concatenate([closed, np.full((*closed.shape[:2], 1), 0.0008)], axis=-1)
         self._scene.add_line_segments("/rest", rest, edge_colour, thickness=LINE)
@@ -159,7 +165,7 @@ class Stage:
             self._remove("/rim")
             return
         points, colours = rim_segments(rim, self._object.corners)
-        self._scene.add_line_segments("/rim", points, colours, thickness=0.005)
+        self._scene.add_line_segments("/rim", points, colours, thickness=RIM)
 
     def show_drawing(self, points: Float[np.ndarray, "n 2"]) -> None:
         """Corners of an outline that is being drawn."""
