@@ -2,13 +2,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/installed
 LOCKED := $(BIN)/pip install --quiet --require-hashes --no-deps
-OPTIONAL := ^(pybullet|pyrealsense2|rerun-sdk|rosbags|ur-rtde|onnx|onnxruntime|onnxscript)==
+OPTIONAL := ^(pybullet|pyrealsense2|rerun-sdk|rosbags|ur-rtde|onnx|onnxscript)==
 
 # `make quick`: these files without their slow tests, under 45 seconds on two idle cores.
 QUICK := actions arm checkpoint cli dataset features geometry golden lever_up meshes objects predictor solids splits \
 	statistics surface topdown trajectories windows
 
-.PHONY: setup lock audit licences demo test quick check bench figures checkpoint docs clean
+.PHONY: setup lock audit licences dist demo test quick check bench figures checkpoint docs clean
 
 setup: $(STAMP)
 
@@ -46,6 +46,15 @@ audit: setup
 licences: setup
 	$(BIN)/python .ci/licences.py > docs/results/licences.md
 
+# What a release consists of, checked as a package host would.
+dist: setup
+	test -d .venv/dist || $(PYTHON) -m venv .venv/dist
+	.venv/dist/bin/pip install --quiet build twine
+	rm -rf dist
+	.venv/dist/bin/python -m build --quiet --outdir dist
+	.venv/dist/bin/twine check --strict dist/*
+	ls -l dist
+
 demo: setup
 	$(BIN)/foretrace demo --out demo
 
@@ -78,7 +87,9 @@ checkpoint: setup
 	$(BIN)/foretrace simulate --recipe all --randomise --exact-share 0.5 --vary-action --off-centre --camera grid \
 		--embodiment tool --objects 300 --seed 4 --out data/calibration
 	$(BIN)/foretrace recalibrate --run runs/default --data data/calibration
-	cp runs/default/config.json runs/default/model.safetensors runs/default/MODEL_CARD.md \
+	rm -f runs/default/model.onnx
+	$(BIN)/foretrace export onnx runs/default --out runs/default/model.onnx
+	cp runs/default/config.json runs/default/model.safetensors runs/default/model.onnx runs/default/MODEL_CARD.md \
 		src/foretrace/predictor/default
 
 docs: setup

@@ -36,6 +36,8 @@ def registered():
     from foretrace.features import FEATURES
     from foretrace.predictor import PREDICTORS
 
+    for registry in (FEATURES, PREDICTORS):
+        list(registry.values())  # those that are declared register themselves once
     before = [(registry, dict(registry._entries)) for registry in (FEATURES, PREDICTORS)]
     yield
     for registry, entries in before:

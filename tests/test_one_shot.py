@@ -10,13 +10,12 @@ from factories import fake_batch
 from foretrace.actions import LeverUp, sample_contacts
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features import Outline
-from foretrace.features.base import UNIT
 from foretrace.features.outline import pixel_error
 from foretrace.features.pivot_edges import NUM_VALUES, PROBES, RIM, find_pivot_edges
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import FLOOR, LEVELS, Futures, quantiles_of
-from foretrace.interactions.hull import MAX_CORNERS
+from foretrace.interactions.hull import MAX_CORNERS, UNIT
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism

@@ -30,7 +30,7 @@ from foretrace.predictor import (
     LstmConfig,
     OneShotConfig,
     TrainConfig,
-    checkpoint,
+    loading,
     part_of,
     train_predictor,
 )
@@ -165,7 +165,7 @@ def test_predict_tells_of_futures(run: Path, picture: Path, tmp_path: Path, caps
 def test_without_a_run_the_shipped_predictor_is_used(
     run: Path, picture: Path, tmp_path: Path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(checkpoint, "DEFAULT", "nothing-here")
+    monkeypatch.setattr(loading, "DEFAULT", "nothing-here")
     with pytest.raises(
         CheckpointError, match="comes without a trained predictor: name the folder of a training"
     ):
@@ -173,7 +173,7 @@ def test_without_a_run_the_shipped_predictor_is_used(
     command = ["predict", "--image", str(picture), "--scale", "0.0014", "--edge", "2", "--no-animation"]
     assert cli.main([*command, "--out", str(tmp_path)]) == 2
     assert "comes without a trained predictor" in capsys.readouterr().err
-    monkeypatch.setattr(checkpoint, "DEFAULT", str(run))
+    monkeypatch.setattr(loading, "DEFAULT", str(run))
     assert cli.main([*command, "--out", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "trajectory.json").read_text())["predictor"] == "default"
 

@@ -17,7 +17,7 @@ from foretrace.files import read_json
 from foretrace.interactions import storage
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.soundness import find_faults
-from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.predictor.loading import default_checkpoint
 from foretrace.schema import conform, parse_json
 
 TEXTS = {

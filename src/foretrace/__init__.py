@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from foretrace.actions import Action, LeverUp, ToolPath
     from foretrace.errors import ForetraceError
     from foretrace.features import FeatureExtractor
-    from foretrace.imagined import Belief
-    from foretrace.interactions.dataset import Dataset, InteractionBatch
+    from foretrace.imagined import Belief, ObservedMotion
+    from foretrace.interactions.batch import InteractionBatch
+    from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
     from foretrace.monitoring import Drift, Monitor, MonitorCalibration, Verdict, identify
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from foretrace.predictor import (
         EffectPredictor,
         LstmConfig,
-        ObservedMotion,
         OneShotConfig,
         PredictorConfig,
         TrainConfig,
@@ -46,8 +46,9 @@ __version__ = "0.1.0"
 _HOMES = {
     "foretrace.actions": ("Action", "LeverUp", "ToolPath"),
     "foretrace.errors": ("ForetraceError",),
-    "foretrace.imagined": ("Belief",),
-    "foretrace.interactions.dataset": ("Dataset", "InteractionBatch"),
+    "foretrace.imagined": ("Belief", "ObservedMotion"),
+    "foretrace.interactions.batch": ("InteractionBatch",),
+    "foretrace.interactions.dataset": ("Dataset",),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
     "foretrace.monitoring": ("Drift", "Monitor", "MonitorCalibration", "Verdict", "identify"),
@@ -61,7 +62,6 @@ _HOMES = {
         *(
             "EffectPredictor",
             "LstmConfig",
-            "ObservedMotion",
             "OneShotConfig",
             "PredictorConfig",
             "TrainConfig",
@@ -127,7 +127,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module 'foretrace' has no attribute {name!r}; it offers {', '.join(__all__)}")
-    value = getattr(import_module(_HOME_OF[name]), name)
+    from foretrace.extras import named_extras
+
+    with named_extras():
+        value = getattr(import_module(_HOME_OF[name]), name)
     globals()[name] = value
     return value
 

@@ -6,6 +6,7 @@ from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
 from foretrace.errors import ForetraceError, shown
+from foretrace.extras import named_extras
 
 T = TypeVar("T")
 
@@ -63,7 +64,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __getitem__(self, label: str) -> T:
         if label not in self._entries and label in self._declared:
-            import_module(self._declared[label])
+            with named_extras():
+                import_module(self._declared[label])
         if label not in self._entries:
             self._load()
         return self._entries[label]

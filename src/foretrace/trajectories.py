@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from dtaidistance import dtw, dtw_ndim
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation, Slerp
 
 from foretrace.errors import ForetraceError
+from foretrace.extras import named_extras
 
 UNIT_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's length from 1."""
@@ -35,6 +34,9 @@ def warped_distance(a: Float[np.ndarray, "time_a dims"], b: Float[np.ndarray, "t
     Raises:
         ValueError: One of them is empty or has values that are not finite.
     """
+    with named_extras():
+        from dtaidistance import dtw, dtw_ndim
+
     for name, values in (("first", a), ("second", b)):
         if len(values) == 0 or not np.isfinite(values).all():
             raise ValueError(f"the {name} trajectory has {len(values)} samples, all must be there and finite")
@@ -145,6 +147,8 @@ def interpolate_poses(
         transforms: The known poses.
         at: Times of the wanted poses [s].
     """
+    from scipy.spatial.transform import Rotation, Slerp
+
     if len(times) == 1:
         return np.repeat(transforms, len(at), axis=0)
     poses = np.tile(np.eye(4), (len(at), 1, 1))

@@ -16,6 +16,7 @@ import foretrace
 from foretrace.cli.console import say
 from foretrace.cli.parsing import Command, Entry, Group, Ready, parse
 from foretrace.errors import ForetraceError
+from foretrace.extras import missing_extra
 
 LEARN, SEE, HAND_ON = "simulate, learn, predict", "cameras and recordings", "other programs and robots"
 """Headings of the list of commands."""
@@ -143,6 +144,8 @@ def _run(arguments: Sequence[str]) -> int:
         except KeyboardInterrupt as interrupt:
             return _status_of(interrupt)
         except ImportError as error:
+            if (missing := missing_extra(error)) is not None:
+                return _refuse(str(missing))
             cause: BaseException | None = error
             while cause is not None:
                 if isinstance(cause, KeyboardInterrupt):  # while a compiled module was loaded

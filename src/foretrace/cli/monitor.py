@@ -11,7 +11,7 @@ from foretrace.imagined import Belief
 from foretrace.interactions.dataset import Dataset
 from foretrace.monitoring import Monitor
 from foretrace.pictures.watched import monitor_figure
-from foretrace.predictor import load_predictor
+from foretrace.predictor import load_imaginer
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -49,9 +49,7 @@ def monitor(
     effect = interaction.effect
     if len(effect.times) == 0:
         raise MonitoringError(f"interaction {id} has no samples: choose one that did not fail")
-    imagined = load_predictor(run).imagine(
-        interaction.view, interaction.action, context=Belief(worlds=worlds)
-    )
+    imagined = load_imaginer(run).imagine(interaction.view, interaction.action, context=Belief(worlds=worlds))
     watched = Monitor(imagined, false_alarms, calibration=calibration)
     verdicts = [
         watched.update(float(t), pose) for t, pose in zip(effect.times, effect.pose_trajectory, strict=True)

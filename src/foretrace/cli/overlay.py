@@ -18,7 +18,7 @@ from foretrace.interactions.recorded import Notes, find_recording, read_notes
 from foretrace.interactions.recording_folder import Frame
 from foretrace.perception.overlay import OBSERVED, PREDICTED, draw_overlay, write_video
 from foretrace.perception.recordings import Recording, open_recording
-from foretrace.predictor import load_predictor
+from foretrace.predictor import load_imaginer
 from foretrace.trajectories import interpolate_poses
 
 SAME_TIME = 0.001
@@ -57,7 +57,7 @@ def overlay(
     if len(rows) == 0:
         raise DatasetError(f"{data} has no recording {id}: give a data set that `foretrace import` made")
     row = int(rows[0])
-    imagined = load_predictor(run).imagine_batch(dataset[row : row + 1].batch())[0]
+    imagined = load_imaginer(run).imagine_batch(dataset[row : row + 1].batch())[0]
     opened = open_recording(recording or find_recording(data, notes), topic or notes.get("topic"))
     times = np.array(notes["frame_times"])
     images = _drawn(_same(opened, times), notes, dataset[row], imagined)

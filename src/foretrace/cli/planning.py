@@ -158,7 +158,7 @@ def plan(
     from foretrace.imagined.context import nominal_constants
     from foretrace.interactions.recording_folder import write_image
     from foretrace.planning import plan as choose
-    from foretrace.predictor import load_predictor
+    from foretrace.predictor import load_imaginer
 
     goal = aim.load()
     seen, thing, T_table_object = _observe(obj, photo, where)
@@ -166,7 +166,7 @@ def plan(
     for name, value in given.items():
         if not 0 < value < float("inf"):
             raise PlanningError(f"{_option(name)} is {value}: give a number above 0")
-    predictor = load_predictor(run)
+    predictor = load_imaginer(run)
     told: Any = None
     if given or unknown:
         usual = {} if unknown else dict(nominal_constants())
@@ -246,7 +246,6 @@ def _observe(
         PlanningError: Options do not go together.
     """
     from foretrace.geometry import planar_transform
-    from foretrace.interactions.dataset import Dataset
 
     if (where.data is None) != (where.id is None):
         raise PlanningError("--data and --id go together: the object of one interaction")
@@ -265,6 +264,8 @@ def _observe(
     if where.data is not None and where.id is not None:
         if obj != ObjectOptions():
             raise PlanningError("--data gives the object: leave out the other ways")
+        from foretrace.interactions.dataset import Dataset
+
         return None, Dataset.open(where.data).with_id(where.id).object, T
     return None, obj.load()[0], T
 

@@ -79,7 +79,7 @@ def predict(
         animation: Write an animation as well.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
     """
-    from foretrace.predictor import load_predictor
+    from foretrace.predictor import load_imaginer
 
     given = [*photo.given(), *_changed(obj), *_changed(at)]
     if run is not None and run.is_file() and run.suffix == ".json":
@@ -89,7 +89,7 @@ def predict(
         if idle := [*given, *_changed(many)]:
             raise PredictionError(f"--example has object and contact: leave out {', '.join(idle)}")
         obj, at = write_example(out / EXAMPLE)
-    predictor = load_predictor(run)
+    predictor = load_imaginer(run)
     values = _given_context(asdict(context), predictor.context, compare)
     told = _told(values, predictor.context, unknown)
     path = ToolPath.of(**{name: value for name, value in values.items() if name in PARAMETERS})

@@ -1,12 +1,13 @@
 """The command that has a real arm execute a lever-up."""
 
+import csv
+import io
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import pandas as pd
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -14,7 +15,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli.console import say
 from foretrace.errors import RobotError
-from foretrace.files import write_json
+from foretrace.files import write_json, write_text
 from foretrace.geometry import matrix_to_pose
 from foretrace.planning import Plan
 from foretrace.robot.checks import ArmLimits, Check, check_path, refuse_unsafe
@@ -183,11 +184,15 @@ def _write(out: Path, legs: list[ArmPath], tips: list[list[np.ndarray]], checks:
     rows, start = [], 0.0
     for leg, along in zip(legs, tips, strict=True):
         for time, joints, tip in zip(leg.times, leg.joints, along, strict=True):
-            rows.append([start + time, leg.name, *joints, *matrix_to_pose(tip)])
+            numbers = (f"{value:.6f}" for value in (start + time, *joints, *matrix_to_pose(tip)))
+            first, *others = numbers
+            rows.append([first, leg.name, *others])
         start += leg.times[-1]
     tip_columns = [f"tip_{name}" for name in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
     columns = ["time_s", "leg", *(f"{name}_rad" for name in JOINT_NAMES), *tip_columns]
-    pd.DataFrame(rows, columns=columns).to_csv(out / "path.csv", index=False, float_format="%.6f")
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    write_text(out / "path.csv", text.getvalue())
     report = [{**asdict(check), "passed": check.passed} for check in checks]
     write_json(out / "checks.json", report)
     print(out / "path.csv")

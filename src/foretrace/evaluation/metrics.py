@@ -9,7 +9,7 @@ from torch import Tensor
 from foretrace.geometry import matrix_to_quaternion, quaternion_to_matrix
 from foretrace.imagined import STARTS, ImaginedBatch
 from foretrace.imagined.context import recorded_context
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.predictor import EffectPredictor
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance, rotation_error

@@ -33,7 +33,7 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import identify
 from foretrace.objects import Prism, Weighted, sample_prism
 from foretrace.pictures.style import new_figure, styled
-from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.predictor.loading import default_checkpoint
 from foretrace.twin import TwinConfig, TwinImaginer
 
 LEARNED_FROM, TRIED = 3, 3

@@ -42,7 +42,7 @@ from foretrace.imagined import ImaginedEffect, conformal_scores
 from foretrace.monitoring import Monitor, MonitorCalibration, Verdict
 from foretrace.monitoring.calibration import SHIPPED
 from foretrace.pictures.style import new_figure, styled
-from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.predictor.loading import default_checkpoint
 
 CHUNK = 5
 """Executions of a trial."""

@@ -32,7 +32,7 @@ from foretrace.experiments.non_flat_data import KINDS, SETTINGS, NonFlatData, Se
 from foretrace.experiments.non_flat_figures import errors_figure, paths_figure
 from foretrace.experiments.training import BASE, Recipe
 from foretrace.features import Option
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor import EffectPredictor, load_predictor
 from foretrace.predictor.config import Device

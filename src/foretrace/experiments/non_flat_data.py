@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Int
 
 from foretrace.errors import DatasetError
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split, split_by_object, split_by_seed
 from foretrace.objects import ObjectModel, object_from_json
 from foretrace.predictor.states import valid_lengths

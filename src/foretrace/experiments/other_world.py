@@ -28,7 +28,7 @@ from foretrace.experiments.training import Recipe, load_levered
 from foretrace.files import atomic_path
 from foretrace.imagined import Futures, ImaginedBatch
 from foretrace.imagined.context import CONSTANTS
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import PAPER_SIZES, Split, scaled_sizes
 from foretrace.pictures.style import new_figure, styled

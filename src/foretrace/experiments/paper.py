@@ -35,7 +35,7 @@ from foretrace.experiments.paper_figures import FIGURES
 from foretrace.experiments.support_points import support_point_metrics
 from foretrace.experiments.training import BASE, Recipe, load_levered
 from foretrace.features import FEATURES, Option
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES
 from foretrace.predictor import PREDICTORS
 from foretrace.predictor.config import Device

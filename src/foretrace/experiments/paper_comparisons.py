@@ -12,7 +12,7 @@ from foretrace.evaluation.experiment import Trial, checked_seeds, chosen
 from foretrace.evaluation.statistics import TEST_TO_TRAIN
 from foretrace.experiments.training import BASE
 from foretrace.features import FEATURES, Option, Outline, PivotEdgeFeatures
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.splits import (
     PAPER_SIZES,
     Split,

@@ -35,7 +35,7 @@ from foretrace.planning import Motions, PlanConfig, goals, plan
 from foretrace.planning.candidates import LOOK_AHEAD, Rim, Scene, find_free, place
 from foretrace.planning.goals import Goal
 from foretrace.predictor import load_predictor
-from foretrace.predictor.checkpoint import MODEL, default_checkpoint
+from foretrace.predictor.loading import MODEL, default_checkpoint
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.recipes import ROUND

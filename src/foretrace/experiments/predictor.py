@@ -16,7 +16,8 @@ from foretrace.evaluation.metrics import evaluate_predictor
 from foretrace.evaluation.tables import markdown_table, number
 from foretrace.experiments import SUMMARIES
 from foretrace.files import short_hash
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor import load_predictor, part_of
 from foretrace.predictor.checkpoint import read_config

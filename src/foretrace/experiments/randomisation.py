@@ -44,7 +44,7 @@ from foretrace.experiments.transfer import distance_until_slip
 from foretrace.experiments.transfer_objects import Subject, everyday_objects, play, printed_shapes
 from foretrace.features import FEATURES
 from foretrace.imagined.context import CONSTANTS, CONTEXT, EXACT, check_names, column_of, true_context
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
 from foretrace.predictor import EffectPredictor

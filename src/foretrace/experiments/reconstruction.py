@@ -22,7 +22,8 @@ from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.tables import markdown_table
 from foretrace.experiments import SUMMARIES
 from foretrace.features.autoencoder import AutoencoderFeatures
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.topdown import VIEW_SIZE
 from foretrace.pictures.style import DPI, INK, styled
 from foretrace.predictor import EffectPredictor, load_predictor, part_of

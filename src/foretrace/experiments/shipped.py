@@ -26,11 +26,11 @@ from foretrace.experiments import SUMMARIES
 from foretrace.experiments.transfer_objects import read_silhouettes
 from foretrace.imagined import STARTS, ImaginedBatch, Imaginer, Start, conformal_scores
 from foretrace.imagined.imaginer import UNSURE
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor import load_predictor
-from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.predictor.loading import default_checkpoint
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.simulation.collect import CollectConfig, num_trials, simulate_trial
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up

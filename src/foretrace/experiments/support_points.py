@@ -15,7 +15,7 @@ from foretrace.features.support_points import (
     order_points,
     points_of,
 )
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.splits import Split
 
 CHOICES = ("sp-pred", "sp-rule", "chance")

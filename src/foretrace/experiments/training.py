@@ -10,7 +10,8 @@ from torch import Tensor
 
 from foretrace.errors import TrainingError, shown
 from foretrace.files import short_hash
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import Split
 from foretrace.predictor import (
@@ -22,7 +23,7 @@ from foretrace.predictor import (
     fit_predictor,
     train_predictor,
 )
-from foretrace.predictor.checkpoint import default_checkpoint
+from foretrace.predictor.loading import default_checkpoint
 from foretrace.predictor.run_folder import MODEL, Progress
 from foretrace.predictor.states import valid_lengths
 from foretrace.predictor.training import RUNTIME

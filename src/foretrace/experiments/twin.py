@@ -29,7 +29,8 @@ from foretrace.experiments.paper_comparisons import CORNERS
 from foretrace.experiments.training import Recipe, load_levered
 from foretrace.experiments.transfer_objects import read_silhouettes
 from foretrace.imagined import Imaginer
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
 from foretrace.objects import Box, Cylinder
 from foretrace.pictures.style import INK, new_figure, styled

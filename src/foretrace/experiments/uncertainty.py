@@ -39,7 +39,8 @@ from foretrace.experiments.uncertainty_metrics import (
     UNLIKE,
     measure,
 )
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_count, split_by_seed
 from foretrace.predictor import OneShotPredictor, load_predictor
 from foretrace.predictor.config import Device

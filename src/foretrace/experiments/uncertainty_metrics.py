@@ -18,7 +18,7 @@ from torch import Tensor
 from foretrace.evaluation.metrics import METRICS
 from foretrace.imagined import LEVELS, Futures, ImaginedBatch
 from foretrace.imagined.context import recorded_context
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.splits import Split
 from foretrace.predictor import OneShotPredictor
 from foretrace.predictor.mixture import Mixture

@@ -5,11 +5,10 @@ import numpy as np
 from foretrace.actions import LeverUp
 from foretrace.errors import ViewError
 from foretrace.features import Outline
-from foretrace.features.base import UNIT
 from foretrace.geometry import convex_hull
 from foretrace.imagined import estimate_com
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.hull import MAX_CORNERS
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS, UNIT
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism
 from foretrace.predictor import EffectPredictor

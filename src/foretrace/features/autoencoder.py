@@ -14,7 +14,7 @@ from foretrace.features.base import FeatureExtractor, FitPart
 from foretrace.features.cnn import initialise_rectified
 from foretrace.features.fitting import FitConfig, fit_network
 from foretrace.features.windows import convolve_windows, crop, find_windows, paste
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 
 ROWS_AT_ONCE = 32
 """Images encoded together: 128 channels of the full size are 8 MiB an image."""

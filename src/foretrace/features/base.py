@@ -20,8 +20,8 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from foretrace.errors import TrainingError, shown
-from foretrace.interactions.batch import Candidates
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import Candidates, InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.registry import Registry, adds_anything
 
 Option = bool | int | float | str
@@ -31,8 +31,6 @@ Precision = Literal["float32", "bfloat16"]
 """Number format of the convolutions during training."""
 
 
-UNIT = 0.1
-"""Lengths in features are divided by this to be of unit scale [m]."""
 ImageName = Literal["mask", "height"]
 """An image of the view."""
 

@@ -12,7 +12,7 @@ from foretrace.errors import TrainingError, shown
 from foretrace.features.base import FeatureExtractor, ImageName, Option, TracedFeatures
 from foretrace.features.shape_context import ShapeContext3200, shape_contexts
 from foretrace.features.windows import convolve_unbranched, convolve_windows
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 
 CHANNELS = (32, 64, 128, 256)
 """Channels of the four convolutions (paper, section 3.3)."""

@@ -9,7 +9,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from foretrace.features.base import FeatureExtractor, FitPart
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 
 
 class MirroredFeatures(FeatureExtractor, abstract=True):

@@ -6,14 +6,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from foretrace.features.base import UNIT, FeatureExtractor
-from foretrace.interactions.batch import Candidates
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.hull import MAX_CORNERS, fit_hull, mask_of
+from foretrace.features.base import FeatureExtractor
+from foretrace.interactions.batch import Candidates, InteractionBatch
+from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT, coarse_heights, hull_rows
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
-
-HEIGHT_CELLS = 32
-"""Cells along a side of the coarse height map."""
 
 
 class Outline(FeatureExtractor):
@@ -44,17 +40,10 @@ class Outline(FeatureExtractor):
         Raises:
             PredictionError: A mask is empty.
         """
-        rows = np.empty((len(batch), MAX_CORNERS, 2))
-        for number, row in enumerate(rows):
-            hull = fit_hull(mask_of(batch, number))
-            row[:] = hull[0]
-            row[: len(hull)] = hull
-        corners = torch.from_numpy(rows / UNIT).float().flatten(1)
+        corners = torch.from_numpy(hull_rows(batch) / UNIT).float().flatten(1)
         if not self.heights:
             return corners
-        side = batch.height.shape[1] // HEIGHT_CELLS
-        rows = batch.height.reshape(len(batch), HEIGHT_CELLS, side, -1).mean(axis=2)
-        cells = rows.reshape(len(batch), HEIGHT_CELLS, HEIGHT_CELLS, side).mean(axis=3)
+        cells = coarse_heights(batch.height)
         return torch.cat([corners, torch.from_numpy(cells / UNIT).float().flatten(1)], dim=1)
 
     def candidate_inputs(self, candidates: Candidates) -> Float[Tensor, "batch features"]:

@@ -13,13 +13,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from foretrace.features.base import UNIT, FeatureExtractor
+from foretrace.features.base import FeatureExtractor
 from foretrace.features.outline import Outline
 from foretrace.features.support_points import HALF_WIDTH, SETBACK
 from foretrace.geometry import polygon_centroid
-from foretrace.interactions.batch import MIRROR
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.hull import MAX_CORNERS, mask_contour
+from foretrace.interactions.batch import MIRROR, InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS, UNIT, mask_contour
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.objects import BEVEL
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from foretrace.errors import PredictionError, TrainingError
 from foretrace.features.base import FeatureExtractor
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.hull import mask_contour
 
 NUM_POINTS = 500

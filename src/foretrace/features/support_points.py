@@ -10,12 +10,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from foretrace.errors import PredictionError, TrainingError
-from foretrace.features.base import UNIT, FeatureExtractor, FitPart
+from foretrace.features.base import FeatureExtractor, FitPart
 from foretrace.features.cnn import initialise_rectified
 from foretrace.features.fitting import FitConfig, fit_network
 from foretrace.geometry import convex_hull, cross, polygon_centroid, support_edge
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.hull import approximate_corners, mask_contour
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.hull import UNIT, approximate_corners, mask_contour
 
 WIDTH = 128
 """Units of each layer of the network (paper, section 3.4)."""

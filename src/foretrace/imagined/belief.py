@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import qmc
 
 from foretrace.errors import PredictionError, check_type, is_number, is_whole, shown
 
@@ -54,6 +53,8 @@ class Belief:
         particles: int = 4096,
         seed: int = 0,
     ) -> None:
+        from scipy.stats import qmc  # a fifth of a second to import
+
         check_type("ranges", ranges, (Mapping, type(None)), PredictionError, "ranges by name")
         for name, value, least, most in (
             ("worlds", worlds, 2, 65536),

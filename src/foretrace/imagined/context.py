@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from foretrace.actions import Action, LeverUp
 from foretrace.errors import PredictionError, TrainingError, shown
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
 
 CONSTANTS = {

@@ -39,8 +39,7 @@ from foretrace.imagined.domain import (
 from foretrace.imagined.futures import Futures, ImaginedBatch, ImaginedEffect
 from foretrace.imagined.observed import SAME_TIME, ObservedMotion, observed_motion, rotations_since_rest
 from foretrace.imagined.worlds import average_worlds, gather_worlds, play_worlds, wrong_worlds
-from foretrace.interactions.batch import Candidates
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.record import Effect
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
@@ -112,6 +111,11 @@ class Imaginer(ABC):
     def name(self) -> str:
         """Name in messages."""
         return type(self).__name__
+
+    @property
+    def display_name(self) -> str:
+        """Name in figures and tables."""
+        return self.name
 
     @property
     def needs_effect(self) -> str | None:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
 
 from foretrace.errors import PredictionError
 from foretrace.geometry import Numbers, continuous_rotation_vectors, finite_array, quaternion_to_matrix
@@ -88,6 +87,8 @@ class ObservedMotion:
         Raises:
             PredictionError: The motion does not begin with the imaginer's first sample or leaves no sample to imagine.
         """
+        from scipy.spatial.transform import Rotation, Slerp
+
         if self.times[0] - sample_times[0] > LATEST_START:
             raise PredictionError(
                 f"the observed motion begins at {self.times[0]:g} s, the predictor's samples at {sample_times[0]:g} s: "

@@ -1,24 +1,20 @@
 """Interactions in memory as arrays, and several actions on one object."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import pairwise
 from numbers import Integral
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
-from foretrace.actions import Action, action_transform
+from foretrace.actions import Action
 from foretrace.errors import DatasetError, RowError, check_type, is_whole, shown, wrong_type
 from foretrace.geometry import finite_array
-from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
-from foretrace.objects import ObjectModel, Weighted
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 """Factors of a vector's coordinates in a mirror along the action axis."""
@@ -113,6 +109,9 @@ class InteractionBatch:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
+        from foretrace.interactions import storage
+        from foretrace.interactions.tables import batch_of, common_times
+
         check_type("interactions", interactions, Iterable, DatasetError)
         interactions = list(interactions)
         for k, interaction in enumerate(interactions):
@@ -157,7 +156,7 @@ class InteractionBatch:
             height=np.array([view.height for view in views], dtype=np.float32).reshape(
                 n, VIEW_SIZE, VIEW_SIZE
             ),
-            corners=_padded(corners, 2),
+            corners=padded(corners, 2),
             num_corners=np.array([len(c) for c in corners], dtype=np.int64),
             object_ids=np.arange(n),
             times=times,
@@ -166,7 +165,7 @@ class InteractionBatch:
             length=np.zeros(n, dtype=np.int64),
             slip_index=np.zeros(n, dtype=np.int64),
             support_points=np.full((n, 2, 2), np.nan),
-            outcome=_outcome_array([""] * n),
+            outcome=outcome_array([""] * n),
             parameters={},
         )
 
@@ -205,100 +204,18 @@ class Candidates:
         return InteractionBatch.from_views([self.view.seen_from(action) for action in self.actions])
 
 
-def common_times(tables: Iterable[pa.Table]) -> Float[np.ndarray, " time"]:
-    """Sample times [s] of the longest interaction in some tables, with which all others agree.
-
-    Raises:
-        DatasetError: Two of them were sampled at different times.
-    """
-    found: dict[bytes, tuple[int, np.ndarray]] = {}  # an interaction of each kind of times
-    for table in tables:
-        for id, row in zip(table["id"].to_pylist(), _lists(table, "times", 1), strict=True):
-            found.setdefault(row.tobytes(), (id, row[:, 0].copy()))
-    longest = max((row for _, row in found.values()), key=len, default=np.zeros(0))
-    for id, row in found.values():
-        if not np.allclose(row, longest[: len(row)], rtol=0, atol=1e-9):
-            raise DatasetError(f"interaction {id} was sampled at other times than the rest; batch it apart")
-    return longest
-
-
-def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndarray) -> InteractionBatch:
-    """Stored interactions as arrays.
-
-    Args:
-        table: Their rows.
-        objects: The objects by their descriptions.
-        times: Their `common_times` [s].
-    """
-    length = np.diff(table["times"].combine_chunks().offsets.to_numpy()).astype(np.int64)
-    corners = _corners_in_action(table, objects)
-    slip_index = table["slip_index"].to_numpy()
-    constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
-    constants["contact_error"] = _contact_errors(table)
-    constants["com_offset"] = _com_offsets(table, objects)
-    return InteractionBatch(
-        ids=table["id"].to_numpy(),
-        mask=storage.unpack_masks(table["mask"].to_pylist()),
-        height=storage.unpack_heights(table["height"].to_pylist()),
-        corners=_padded(corners, 2),
-        num_corners=np.array([len(c) for c in corners], dtype=np.int64),
-        object_ids=table["object_id"].to_numpy(),
-        times=times,
-        com=_padded(_lists(table, "com_trajectory", 3), 3, len(times)),
-        pose=_padded(_lists(table, "pose_trajectory", 7), 7, len(times)),
-        length=length,
-        slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
-        support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
-        outcome=_outcome_array(table["outcome"].to_pylist()),
-        parameters=constants | storage.parameter_values(table),
-    )
-
-
-def _contact_errors(table: pa.Table) -> Float[np.ndarray, " batch"]:
-    """Distances of executed contacts from commanded ones [m]; NaN for recordings, where they were not measured."""
-    ahead, left = (table[storage.EXECUTION + name].to_numpy().astype(float) for name in ("ahead", "left"))
-    simulated = np.array([source == "simulated" for source in table["source"].to_pylist()], dtype=bool)
-    return np.where(simulated, np.hypot(ahead, left), np.nan)
-
-
-def _com_offsets(table: pa.Table, objects: Mapping[str, ObjectModel]) -> Float[np.ndarray, " batch"]:
-    """Distances of the centres of mass from those of uniform objects [m]."""
-    known = [objects[description] for description in table["object"].to_pylist()]
-    offsets = [obj.com_offset if isinstance(obj, Weighted) else np.zeros(2) for obj in known]
-    return np.linalg.norm(np.array(offsets).reshape(-1, 2), axis=1)
-
-
-def _corners_in_action(table: pa.Table, objects: Mapping[str, ObjectModel]) -> list[np.ndarray]:
-    """Each object's corners in its action's frame at rest [m]."""
-    corners = []
-    columns = (table[name].to_pylist() for name in ("object", "contact", "direction"))
-    for description, contact, direction in zip(*columns, strict=True):
-        unit = np.array(direction)
-        # Dividing by a length of almost 1 again keeps features as they have always been, to the last bit.
-        T_action_object = action_transform(np.array(contact), unit / np.linalg.norm(unit))
-        corners.append(objects[description].corners @ T_action_object[:2, :2].T + T_action_object[:2, 3])
-    return corners
-
-
-def _outcome_array(outcomes: Sequence[str]) -> np.ndarray:
+def outcome_array(outcomes: Sequence[str]) -> np.ndarray:
     """Names as an array whose width, and so its bytes, does not depend on which of a lever-up's outcomes occur."""
     return np.array(outcomes, dtype=f"<U{max(8, *map(len, outcomes), 0)}")
 
 
-def _padded(arrays: Sequence[np.ndarray], width: int, longest: int | None = None) -> np.ndarray:
+def padded(arrays: Sequence[np.ndarray], width: int, longest: int | None = None) -> np.ndarray:
     """(n, longest, width) from arrays of (k, width), NaN past the end of each."""
     longest = max((len(a) for a in arrays), default=0) if longest is None else longest
     padded = np.full((len(arrays), longest, width), np.nan)
     for k, array in enumerate(arrays):
         padded[k, : len(array)] = array
     return padded
-
-
-def _lists(table: pa.Table, name: str, width: int) -> list[np.ndarray]:
-    """A list column as one (k, width) array per row, without a copy."""
-    column = table[name].combine_chunks()
-    flat, offsets = column.values.to_numpy(zero_copy_only=False), column.offsets.to_numpy()
-    return [flat[a:b].reshape(-1, width) for a, b in pairwise(offsets)]
 
 
 def chosen_rows(number: int, rows: Any) -> Int[np.ndarray, " chosen"]:

@@ -6,24 +6,28 @@ from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from foretrace.actions import ACTIONS, FAILED
 from foretrace.errors import DatasetError, RowError, ShapeError, check_type, is_whole, shown
+from foretrace.extras import named_extras
 from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
-from foretrace.interactions.batch import batch_of, chosen_rows, common_times
+from foretrace.interactions.batch import chosen_rows
 from foretrace.interactions.record import Interaction
 from foretrace.interactions.soundness import check_shard
+from foretrace.interactions.tables import batch_of, common_times
 from foretrace.objects import ObjectModel, object_from_json
 from foretrace.schema import parse_json
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CACHE_BYTES = 256 * 2**20
 """A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
@@ -220,9 +224,10 @@ class Dataset:
         """
         return common_times(self._pieces(["id", "times"]))
 
-    def to_pandas(self) -> pd.DataFrame:
+    def to_pandas(self) -> "pd.DataFrame":
         """The rows as a data frame, trajectories flattened, images packed."""
-        return self.table.to_pandas()
+        with named_extras():
+            return self.table.to_pandas()
 
     def outcomes(self) -> dict[str, int]:
         """Number of interactions with each outcome that occurs, in the order in which actions name them."""

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 
 from foretrace.errors import PredictionError
 from foretrace.geometry import convex_hull
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, largest_object, outline_of
 
 CORNER_TOLERANCE = 1.25 * METRES_PER_PIXEL
@@ -25,6 +25,11 @@ HULL_MARGIN = 1.6
 """Points of the outline further inside the hull than this lie in a notch and do not count [pixels]."""
 FARTHEST_CORNER = 4.0
 """Lines that meet further than this from where the outline turns do not make its corner [pixels]."""
+
+UNIT = 0.1
+"""Lengths in features are divided by this to be of unit scale [m]."""
+HEIGHT_CELLS = 32
+"""Cells along a side of a coarse height map."""
 
 Moments = Float[np.ndarray, "*batch 6"]
 """Of points: their number and the sums of x, y, xx, xy, yy."""
@@ -95,6 +100,29 @@ def fit_hull(mask: Bool[np.ndarray, "128 128"]) -> Float[np.ndarray, "n 2"]:
     corners = _meeting_points(np.roll(middle, 1, axis=0), np.roll(along, 1, axis=0), middle, along)
     strayed = np.linalg.norm(corners - points[first], axis=1) > FARTHEST_CORNER
     return _metres(np.where(strayed[:, None], points[first], corners) + centre)
+
+
+def hull_rows(batch: InteractionBatch) -> Float[np.ndarray, "batch 24 2"]:
+    """Corners of each object's convex hull as of `fit_hull` [m]; the first one fills its row.
+
+    Raises:
+        PredictionError: A mask is empty.
+    """
+    rows = np.empty((len(batch), MAX_CORNERS, 2))
+    for number, row in enumerate(rows):
+        hull = fit_hull(mask_of(batch, number))
+        row[:] = hull[0]
+        row[: len(hull)] = hull
+    return rows
+
+
+def coarse_heights(
+    height: Float[np.ndarray, "batch 128 128"],
+) -> Float[np.ndarray, "batch 32 32"]:
+    """Mean heights over 4 x 4 pixels [m], 0 beside the object."""
+    side = height.shape[1] // HEIGHT_CELLS
+    rows = height.reshape(len(height), HEIGHT_CELLS, side, -1).mean(axis=2)
+    return rows.reshape(len(height), HEIGHT_CELLS, HEIGHT_CELLS, side).mean(axis=3)
 
 
 def _metres(corners: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
 
 from foretrace.errors import SimulationError
 from foretrace.geometry import quaternion_to_matrix
@@ -31,6 +30,8 @@ class Body:
     """What it collides with: hulls of vertices, cylinders, or both, in the object frame."""
 
     def __post_init__(self) -> None:
+        from scipy.spatial import ConvexHull, QhullError
+
         inertia = np.linalg.eigvalsh(self.mass.inertia)
         if not 0 < self.mass.mass < np.inf:
             raise SimulationError(f"a body of mass {self.mass.mass:g} kg: it must be finite and above 0")
@@ -63,6 +64,8 @@ class Body:
     @classmethod
     def hull(cls, vertices: Float[np.ndarray, "n 3"], mass: float) -> "Body":
         """The convex hull of points [m], of uniform density and a mass [kg]."""
+        from scipy.spatial import ConvexHull, QhullError
+
         try:
             corners = vertices[ConvexHull(vertices).vertices]
         except (QhullError, ValueError, IndexError) as error:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 import shapely
 from jaxtyping import Float
-from scipy.spatial.distance import pdist
 
 from foretrace.objects.model import fitting_bevel
 from foretrace.objects.prism import CIRCLE_RADIUS, Prism, sample_prism
@@ -115,6 +114,8 @@ def _sound(draw: Callable[[], shapely.Geometry]) -> shapely.Polygon:
 
 def _flat(outline: shapely.Polygon, height: float) -> Prism:
     """The prism of an outline, around its centroid."""
+    from scipy.spatial.distance import pdist
+
     kept = shapely.simplify(outline, CURVE_TOLERANCE)
     corners = shapely.get_coordinates(kept)[:-1] - shapely.get_coordinates(shapely.centroid(kept))
     corners *= min(1.0, 2 * HALF_LENGTHS[1] / pdist(corners).max())

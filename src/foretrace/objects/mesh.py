@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Float, Int
-from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError, is_number, shown
 from foretrace.files import as_path
@@ -146,6 +145,8 @@ class MeshObject(ObjectModel):
     @cached_property
     def stands(self) -> bool:
         """Whether the mesh stays as it stands: no small tilt lets its centre of mass sink, and a larger one further."""
+        from scipy.spatial import ConvexHull
+
         com = np.array([*self._mesh.center_mass])
         points = self.vertices[ConvexHull(self.vertices).vertices] - com
         heading = np.arange(0.0, 2 * np.pi, np.pi / 16)
@@ -219,6 +220,8 @@ class MeshObject(ObjectModel):
 
     @cached_property
     def _pieces(self) -> list[np.ndarray]:
+        from scipy.spatial import ConvexHull
+
         pieces = [np.array(self.vertices)] if self._convex else cached_pieces(self.vertices, self.faces)
         bevelled, volume = [], 0.0
         for vertices in pieces:
@@ -279,6 +282,7 @@ def resting_rotation(
 ) -> Float[np.ndarray, "3 3"]:
     """Smallest rotation that puts a solid onto a side on which its centre of mass is lowest: it rests there."""
     import trimesh
+    from scipy.spatial import ConvexHull
 
     middle = vertices.mean(axis=0)  # far from the origin, the integrals lose digits
     com = middle + trimesh.Trimesh(vertices - middle, faces, process=False).center_mass
@@ -332,6 +336,8 @@ def clip_polytope(
     vertices: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"], offset: float
 ) -> Float[np.ndarray, "m 3"]:
     """Vertices of the part of a convex body where ``normal . x >= offset``; no rows where nothing is left."""
+    from scipy.spatial import ConvexHull
+
     depth = vertices @ normal - offset
     depth[np.abs(depth) <= ON_PLANE] = 0.0
     kept, cut = depth >= 0, depth < 0

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError
 from foretrace.objects.decomposition import Faces, Points, as_solid, surface_of
@@ -76,6 +75,8 @@ def one_solid(vertices: Points, faces: Faces) -> tuple[Points, Faces]:
 
 def is_convex_body(mesh: Any) -> bool:
     """Whether a ``trimesh.Trimesh`` is its own hull; trimesh itself overlooks that two bodies touch in a corner."""
+    from scipy.spatial import ConvexHull
+
     return bool(mesh.is_convex and abs(mesh.volume) > 0.999 * ConvexHull(mesh.vertices).volume)
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import shapely
 from jaxtyping import Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from foretrace.errors import ForetraceError, ShapeError, shown
 from foretrace.geometry import polygon_area
@@ -93,6 +91,9 @@ def unfolded(vertices: Points, faces: Faces) -> Faces:
     Readers cut every polygon into a fan, whose triangles overlap where the polygon is not convex: some lie on their
     backs. Flat groups of faces with such a fold are cut anew.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     triangles = vertices[faces]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 import shapely
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from foretrace.errors import ForetraceError, ShapeError, check_type, is_number, shown
 from foretrace.geometry import convex_hull
@@ -252,6 +251,8 @@ def convex_mass_properties(pieces: list[Float[np.ndarray, "_ 3"]], density: floa
 
     Each piece is cut into tetrahedra between an inner point and the triangles of its hull.
     """
+    from scipy.spatial import ConvexHull
+
     tetrahedra = []
     for piece in pieces:
         apex = piece.mean(axis=0)

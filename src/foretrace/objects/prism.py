@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 import shapely
 from jaxtyping import Float, Shaped
-from scipy.spatial import KDTree
 
 from foretrace.errors import ShapeError, check_type, is_number, is_whole, shown
 from foretrace.geometry import (
@@ -238,9 +237,10 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     apart = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1) > SAME_CORNER
     if apart.sum() >= 3:  # a polygon that is closed, or a corner given twice in a row
         corners = corners[apart]
-    same = KDTree(corners).query_pairs(SAME_CORNER)
-    if same:
-        first, second = min(same)
+    points = np.asarray(shapely.points(corners))
+    same = shapely.STRtree(points).query(points, predicate="dwithin", distance=SAME_CORNER).T
+    if len(same := same[same[:, 0] < same[:, 1]]):
+        first, second = min(same.tolist())
         raise ShapeError(
             f"corners {first} and {second} are both {corners[first].tolist()}: give each corner once, in order"
         )

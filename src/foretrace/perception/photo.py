@@ -21,7 +21,6 @@ from foretrace.objects.prism import DEFAULT_HEIGHT
 from foretrace.perception import masks
 from foretrace.perception.markers import LEAST_SLANT, MarkerLayout, align_patterns, detect_markers
 from foretrace.perception.overlay import PREDICTED, draw_overlay
-from foretrace.perception.tracking import still_pose
 from foretrace.perception.views import (
     Observation,
     check_height,
@@ -206,6 +205,8 @@ def locate_camera(
     if layout is not None:
         seen = align_patterns(image, detect_markers(image, layout.dictionary), layout.dictionary)
         try:
+            from foretrace.perception.tracking import still_pose  # a quarter of a second to import
+
             return invert_transform(still_pose([seen], layout.table, camera))
         except PerceptionError as error:
             if depth is None:

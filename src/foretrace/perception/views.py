@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
-from scipy.optimize import least_squares
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ActionError, PerceptionError, ShapeError, fault, is_number, shown
@@ -237,11 +236,14 @@ def _start(seen: shapely.Polygon, known: shapely.Polygon, angle: float) -> np.nd
 
 def _refine(seen: shapely.Polygon, corners: np.ndarray, start: np.ndarray) -> np.ndarray:
     """x, y and angle near a start for which points of one outline lie on the other, by least squares."""
+    from scipy.optimize import least_squares
+
     ring = shapely.LinearRing(corners)
     along = np.linspace(0, 1, 80, endpoint=False)
     points = shapely.get_coordinates(shapely.line_interpolate_point(seen.exterior, along, normalized=True))
 
     def away(pose: np.ndarray) -> np.ndarray:
+
         cosine, sine = np.cos(pose[2]), np.sin(pose[2])
         back = (points - pose[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
         return np.asarray(shapely.distance(ring, shapely.points(back)))

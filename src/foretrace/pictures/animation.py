@@ -119,11 +119,51 @@ def frames(scene: Scene, width: int = 960, height: int = 450) -> Iterator[np.nda
 
 def project(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points in the action frame as the camera sees them: right, up, towards the camera (orthographic)."""
+    return points @ _VIEW.T
+
+
+def _view() -> Float[np.ndarray, "3 3"]:
     right = np.array([-np.sin(AZIMUTH), np.cos(AZIMUTH), 0.0])
     towards = np.array(
         [np.cos(ELEVATION) * np.cos(AZIMUTH), np.cos(ELEVATION) * np.sin(AZIMUTH), np.sin(ELEVATION)]
     )
-    return points @ np.stack([right, np.cross(towards, right), towards]).T
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+_VIEW = _view()
+"""Rows: the camera's axes, to the right, up, and towards it."""
+
+
+class _Solid:
+    """Flat faces that move together.
+
+    Args:
+        faces: Each one's corners in the solid's frame, counter-clockwise from outside [m].
+        color: Their colour where the light falls on them.
+        edge: Colour of their edges; None: that of the face.
+        both: Whether they are seen from both sides.
+    """
+
+    def __init__(self, faces: list[np.ndarray], color: str, edge: str | None, both: bool = False):
+        self.points, self._ends = np.concatenate(faces), np.cumsum([len(face) for face in faces])[:-1]
+        self._normals, self._both = np.stack([_normal(face) for face in faces]), both
+        self._color, self.edge = np.array(to_rgb(color)), edge
+
+    def seen(
+        self, pose: Float[np.ndarray, "4 4"]
+    ) -> list[tuple[float, Float[np.ndarray, "_ 2"], tuple[float, ...]]]:
+        """Of each face that is seen: how near it is, its corners in the camera's plane [m], and its colour."""
+        flat = project(transform_points(pose, self.points))
+        normals = self._normals @ pose[:3, :3].T
+        shades = np.clip(self._color * (0.72 + 0.36 * np.maximum(normals @ LIGHT, 0.0))[:, None], 0, 1)
+        shown = self._both | (normals @ _VIEW[2] > 0)
+        return [
+            (float(corners[:, 2].mean()), corners[:, :2], tuple(shade))
+            for corners, shade, visible in zip(
+                np.split(flat, self._ends), shades.tolist(), shown, strict=True
+            )
+            if visible
+        ]
 
 
 class _Stage:
@@ -138,9 +178,10 @@ class _Stage:
 
     def __init__(self, scene: Scene, scale: np.ndarray, origin: np.ndarray, size: tuple[int, int]):
         self.scene, self._scale, self._origin, self._size = scene, scale, origin, size
-        self._faces = faces_of(scene.obj, DRAWN_FACETS)
         is_mesh = isinstance(scene.obj.shape, MeshObject)
-        self._edges = None if is_mesh else OBJECT_EDGE  # no triangles on meshes
+        edge = None if is_mesh else OBJECT_EDGE  # no triangles on meshes
+        self._body = _Solid(faces_of(scene.obj, DRAWN_FACETS), "#c3d3e6", edge)
+        self._blade = _Solid(_tool_faces(), TOOL_COLOR, None, both=True)
         self._traces = [(trace, self._pixels(trace.path)) for trace in scene.paths()]
         self._tube = self._shape_of_tube()
 
@@ -154,10 +195,16 @@ class _Stage:
         """The object's shadow, object and blade, other motions, the region, and the paths up to sample ``k``."""
         scene = self.scene
         pose = pose_to_matrix(scene.pose[k])
-        body = [transform_points(pose, face) for face in self._faces]
-        shadow = convex_hull(np.concatenate(body)[:, :2])
+        shadow = convex_hull(transform_points(pose, self._body.points)[:, :2])
         _fill(picture, self._pixels(np.column_stack([shadow, np.zeros(len(shadow))])), "#cfd3da")
-        self._draw_solids(picture, body, None if scene.tool is None else scene.tool[k])
+        faces = [(*face, self._body.edge) for face in self._body.seen(pose)]
+        if scene.tool is not None:
+            faces += [(*face, None) for face in self._blade.seen(pose_to_matrix(scene.tool[k]))]
+        faces.sort(key=lambda face: face[0])  # the far ones first
+        for _, flat, color, edge in faces:
+            corners = self._in_picture(flat)
+            _fill(picture, corners, color)
+            _line(picture, np.concatenate([corners, corners[:1]]), edge or color, 1)
         for ghost in scene.ghosts:
             self._draw_edges(picture, ghost.pose[min(k, len(ghost.pose) - 1)], ghost.color, ghost.width)
         if scene.support_points is not None:
@@ -174,24 +221,10 @@ class _Stage:
         for trace, pixels in self._traces:
             self._draw_trace(picture, trace, pixels, k)
 
-    def _draw_solids(self, picture: np.ndarray, body: list[np.ndarray], tool: np.ndarray | None) -> None:
-        faces = [(face, _shaded("#c3d3e6", face), self._edges) for face in body if _faces_us(face)]
-        if tool is not None:
-            tip = pose_to_matrix(tool)
-            blade = [transform_points(tip, face) for face in _tool_faces()]
-            faces += [(face, _shaded(TOOL_COLOR, face), None) for face in blade]
-        faces.sort(key=lambda face: project(face[0])[:, 2].mean())  # the far ones first
-        for face, color, edge in faces:
-            corners = self._pixels(face)
-            _fill(picture, corners, color)
-            _line(picture, np.concatenate([corners, corners[:1]]), edge or color, 1)
-
     def _draw_edges(self, picture: np.ndarray, pose: np.ndarray, color: str, width: float) -> None:
-        placed = [transform_points(pose_to_matrix(pose), face) for face in self._faces]
-        for face in placed:
-            if _faces_us(face):
-                corners = self._pixels(face)
-                _line(picture, np.concatenate([corners, corners[:1]]), color, round(width))
+        for _, flat, _ in self._body.seen(pose_to_matrix(pose)):
+            corners = self._in_picture(flat)
+            _line(picture, np.concatenate([corners, corners[:1]]), color, round(width))
 
     def _draw_trace(self, picture: np.ndarray, trace: Trace, pixels: np.ndarray, k: int) -> None:
         _line(picture, pixels, _paler(trace.color), 1)
@@ -219,8 +252,12 @@ class _Stage:
 
     def _pixels(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Columns and rows of points in the action frame."""
-        flat = project(points)[:, :2] * CM * self._scale + self._origin
-        return np.column_stack([flat[:, 0], self._size[0] - flat[:, 1]])
+        return self._in_picture(project(points)[:, :2])
+
+    def _in_picture(self, flat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Columns and rows of points in the camera's plane [m]."""
+        places = flat * CM * self._scale + self._origin
+        return np.column_stack([places[:, 0], self._size[0] - places[:, 1]])
 
 
 _CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 32, endpoint=False)) for f in (np.cos, np.sin)])
@@ -274,16 +311,6 @@ def _normal(face: np.ndarray) -> np.ndarray:
     return normal / max(np.linalg.norm(normal), 1e-12)
 
 
-def _faces_us(face: np.ndarray) -> bool:
-    return bool(project(_normal(face))[2] > 0)
-
-
-def _shaded(color: str, face: np.ndarray) -> tuple[float, ...]:
-    """The colour of a face under the light."""
-    facing = max(float(_normal(face) @ LIGHT), 0.0)
-    return tuple(np.clip(np.array(to_rgb(color)) * (0.72 + 0.36 * facing), 0, 1).tolist())
-
-
 def _table_corners(scene: Scene) -> np.ndarray:
     """(4, 3) corners of the drawn part of the table."""
     # As far as an object rolls; one that falls has left the table.
@@ -311,6 +338,9 @@ def _limits(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], period: float) -> None:
     images = [Image.fromarray(picture) for picture in pictures]
     palette = images[len(images) // 2].quantize(COLORS, dither=Image.Dither.NONE)
+    found = np.reshape(palette.getpalette() or [], (-1, 3))
+    found[found.sum(axis=1).argmax()] = 255  # white was averaged with what is nearly white
+    palette.putpalette(found.ravel().tolist())
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [round(1000 * period)] * (len(images) - 1) + [round(1000 * LAST_FRAME_TIME)]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from foretrace.actions import Action
 from foretrace.errors import PlanningError
@@ -155,6 +154,8 @@ class Motions:
         self, rows: Int[np.ndarray, " n"], futures: Int[np.ndarray, " n"], samples: Int[np.ndarray, " time"]
     ) -> Float[np.ndarray, "n time points 2"]:
         """Corners of the object's hull from above, upper and lower ones, at samples of some futures [m]."""
+        from scipy.spatial.transform import Rotation
+
         hull = convex_hull(self.outline)
         low = np.column_stack([hull, np.zeros(len(hull))])
         corners = np.concatenate([low, low + np.array([0.0, 0.0, self.height])])

@@ -1,5 +1,6 @@
 """Choose where, which way and how an object is levered, by what is imagined of the candidates."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from foretrace.actions import LeverUp
 from foretrace.errors import PlanningError, check_choices, check_ranges, check_type, is_whole, shown
+from foretrace.extras import MissingExtraError
 from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined import IMAGINERS, Belief, Imaginer
 from foretrace.imagined.context import Context
@@ -90,7 +92,8 @@ def plan(
             returns costs. Everything in it lies in the object's frame.
         imaginer: Imagines the candidates; by default the predictor that comes with foretrace.
         context: What both imaginers are told, as of `Imaginer.imagine`.
-        checker: Checks the best candidates; by default the twin, which simulates them.
+        checker: Checks the best candidates; by default the twin, which simulates them. Where simulation is not
+            installed they are not checked, and a warning says so.
         config: How candidates are searched; stages can be left out.
         com: Centre of mass at rest in the object's frame [m]; by default the object's own, or estimated from the view.
         T_table_object: The object's pose in the table frame, if the plan is for a robot.
@@ -118,8 +121,17 @@ def plan(
     own = _learned() if imaginer is None else imaginer
     second = None
     if config.check:
-        second = IMAGINERS.find("twin")(scene.object) if checker is None else checker
+        second = _twin(scene.object) if checker is None else checker
     return Search(scene, aim, own, second, context, config, reach).run(T_table_object)
+
+
+def _twin(obj: ObjectModel | None) -> Imaginer | None:
+    """The twin; None, with a warning, where simulation is not installed."""
+    try:
+        return IMAGINERS.find("twin")(obj)
+    except MissingExtraError as missing:
+        warnings.warn(f"the best candidates are not checked by the twin: {missing}", stacklevel=3)
+        return None
 
 
 @lru_cache(maxsize=1)

@@ -15,8 +15,7 @@ from foretrace.features import Precision
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes, Start
 from foretrace.imagined.context import CONSTANTS
 from foretrace.imagined.domain import Ranges, find_unusual
-from foretrace.interactions.batch import Candidates
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.config import PredictorConfig
 from foretrace.predictor.states import (
@@ -392,6 +391,8 @@ class EffectPredictor(Imaginer, nn.Module):
 
 PREDICTORS: Registry[type[EffectPredictor]] = Registry("predictor", "foretrace.predictors", TrainingError)
 """Every predictor class by its label."""
+PREDICTORS.declare("lstm", "foretrace.predictor.lstm")
+PREDICTORS.declare("one-shot", "foretrace.predictor.one_shot")
 
 
 @contextmanager

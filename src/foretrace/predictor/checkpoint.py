@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -18,14 +17,11 @@ from foretrace.imagined.domain import known_ranges
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.base import PREDICTORS, EffectPredictor
 from foretrace.predictor.config import TrainConfig, check_outcomes
+from foretrace.predictor.loading import CONFIG, MODEL
 from foretrace.schema import Vector2, conform
 
 FORMAT = "foretrace-predictor"
 FORMAT_VERSION = 2
-CONFIG = "config.json"
-MODEL = "model.safetensors"
-DEFAULT = "default"
-"""Folder of the predictor that comes with the package."""
 RANGES = "ranges"
 """Entry of ``config.json`` that is there only once the training is finished."""
 CALIBRATION = "calibration"
@@ -98,30 +94,12 @@ def save_checkpoint(
     write_json(directory / CONFIG, describe(predictor) | {"training": dict(training or {})})
 
 
-def default_checkpoint() -> Path:
-    """The folder of the predictor that comes with the package.
-
-    Raises:
-        CheckpointError: None came with it.
-    """
-    path = Path(str(files("foretrace.predictor"))) / DEFAULT
-    if not (path / CONFIG).is_file():
-        raise CheckpointError(
-            "this installation comes without a trained predictor: name the folder of a training, from `foretrace train`"
-        )
-    return path
-
-
-def load_predictor(path: str | Path | None = None) -> EffectPredictor:
+def read_predictor(path: Path) -> EffectPredictor:
     """Read a predictor from a folder that `save_checkpoint` or `train_predictor` wrote.
-
-    Args:
-        path: The folder; by default that of the predictor that comes with the package.
 
     Raises:
         CheckpointError: A file is missing or damaged, of another version, or the tensors do not fit.
     """
-    path = default_checkpoint() if path is None else as_path(path, CheckpointError)
     config = read_config(path)
     model = path / MODEL
     if not model.is_file():

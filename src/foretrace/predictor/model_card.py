@@ -11,7 +11,8 @@ from foretrace.errors import TrainingError
 from foretrace.files import as_json, flatten, read_json
 from foretrace.imagined import STARTS, conformal_scores
 from foretrace.imagined.domain import MEASURES, QUANTILES
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.objects import CORNER_COUNTS
 from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, part_of
 from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, read_config

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from foretrace.errors import TrainingError
 from foretrace.features import Outline
-from foretrace.features.base import UNIT
-from foretrace.features.outline import HEIGHT_CELLS, pixel_error
+from foretrace.features.outline import pixel_error
 from foretrace.features.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
 from foretrace.imagined import (
     LEVELS,
@@ -23,8 +22,8 @@ from foretrace.imagined import (
     conformal_scores,
     quantiles_of,
 )
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.hull import MAX_CORNERS
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.config import (
     PredictorConfig,

@@ -10,7 +10,8 @@ from torch import Tensor
 from foretrace.errors import TrainingError, shown
 from foretrace.imagined.context import column_of, recorded_context
 from foretrace.imagined.domain import estimate_com, measure
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split, split_by_seed
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.config import TrainConfig

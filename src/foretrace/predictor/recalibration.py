@@ -9,7 +9,7 @@ from foretrace.errors import TrainingError, check_type, shown
 from foretrace.files import as_path, write_json
 from foretrace.imagined import STARTS, conformal_scores
 from foretrace.interactions.dataset import Dataset
-from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, load_predictor, read_config, write_tensors
+from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, read_config, read_predictor, write_tensors
 from foretrace.predictor.parts import effects_of, features_of, outcome_of, prepare, usable_lengths
 from foretrace.predictor.run_folder import MODEL, RunFolder, fingerprint
 
@@ -39,7 +39,7 @@ def recalibrate(run: str | Path, data: Dataset) -> dict[str, list[float]]:
     """
     folder = RunFolder(as_path(run, TrainingError))
     check_type("data", data, Dataset, TrainingError)
-    config, predictor = read_config(folder.path), load_predictor(folder.path)
+    config, predictor = read_config(folder.path), read_predictor(folder.path)
     if not folder.finished:
         raise TrainingError(
             f"the training in {folder.path} is not finished: the command that began it goes on"

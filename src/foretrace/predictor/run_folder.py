@@ -32,7 +32,8 @@ from foretrace.files import (
     write_text,
 )
 from foretrace.imagined.context import column_of
-from foretrace.interactions.dataset import Dataset, InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import (

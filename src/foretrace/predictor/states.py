@@ -15,7 +15,7 @@ from foretrace.geometry import (
     rotation_from_6d,
     rotation_vector_to_quaternion,
 )
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import InteractionBatch
 
 StateKind = Literal["position", "pose", "turn"]
 """``position``: the centre of mass. ``pose``: the centre of mass and the rotation since rest (6-D). ``turn``: the same

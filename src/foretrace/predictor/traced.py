@@ -8,12 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foretrace.features.base import UNIT
-from foretrace.features.outline import HEIGHT_CELLS
 from foretrace.geometry import quaternion_to_matrix, rotation_from_6d
 from foretrace.imagined import FLOOR, LEVELS, STARTS
 from foretrace.imagined.context import CONTEXT
-from foretrace.interactions.hull import MAX_CORNERS
+from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.predictor.states import decode_poses, rest_states
 
 if TYPE_CHECKING:

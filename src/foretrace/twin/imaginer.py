@@ -27,8 +27,7 @@ from foretrace.imagined import (
     quantiles_of,
 )
 from foretrace.imagined.context import CONSTANTS, PARAMETERS
-from foretrace.interactions.batch import Candidates
-from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel, Weighted
 from foretrace.simulation.randomisation import RANDOMISED, Randomisation

@@ -17,7 +17,6 @@ from foretrace.errors import (
     shown,
 )
 from foretrace.features import Outline
-from foretrace.features.base import UNIT
 from foretrace.features.pivot_edges import find_pivot_edges
 from foretrace.files import as_path, make_folder, read_versioned, write_json
 from foretrace.geometry import rotation_vector_to_quaternion
@@ -30,8 +29,8 @@ from foretrace.imagined import (
     quantiles_of,
 )
 from foretrace.imagined.observed import rotations_since_rest
-from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.hull import MAX_CORNERS
+from foretrace.interactions.batch import InteractionBatch
+from foretrace.interactions.hull import MAX_CORNERS, UNIT
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
 from foretrace.predictor.mixture import TURN_LENGTH
 from foretrace.predictor.runtime import seeded, thread_count
