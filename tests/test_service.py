@@ -8,6 +8,7 @@ import pytest
 import foretrace as ft
 from foretrace import cli
 from foretrace.geometry import transform_points
+from foretrace.predictor import load_imaginer
 
 pytest.importorskip("fastapi")
 pytest.importorskip("httpx2")
@@ -35,7 +36,7 @@ def test_a_prediction_is_the_librarys(client):
     obj = ft.Prism(CORNERS)
     action = ft.LeverUp.nearest(obj, (0.0, 0.08))
     com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
-    direct = ft.load_predictor().imagine(
+    direct = load_imaginer().imagine(
         ft.TopDownView.of(obj, action), action, context={"friction": 0.7}, com=com
     )
     assert told == {"times": direct.times.tolist()} | json.loads(json.dumps(direct.to_dict(0.5, 3)))

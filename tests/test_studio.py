@@ -11,6 +11,7 @@ import foretrace as ft
 from foretrace import cli
 from foretrace.errors import ForetraceError
 from foretrace.geometry import transform_points
+from foretrace.predictor import load_imaginer
 from foretrace.studio import saving
 from foretrace.studio.choices import Choices, link_of
 from foretrace.studio.controls import verdict_html
@@ -126,7 +127,7 @@ def test_the_session_imagines_what_the_library_does():
     action, obj = session.action, session.choices.object
     com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
     told = {"tool_friction": 0.3, "density": 600.0, "contact_error": 0.0}
-    direct = ft.load_predictor().imagine(ft.TopDownView.of(obj, action), action, context=told, com=com)
+    direct = load_imaginer().imagine(ft.TopDownView.of(obj, action), action, context=told, com=com)
     np.testing.assert_array_equal(direct.com_trajectory, session.imagined.com_trajectory)
     assert np.isnan(session.imagined.context["friction"])
 
