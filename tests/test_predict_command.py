@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,9 @@ from foretrace.cli.example import CONTACT, HEIGHT, MASK, SCALE
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined.futures import carried_poses
 from foretrace.imagined.observed import rotations_since_rest
+from foretrace.pictures import animation
+from foretrace.pictures.prediction import scene_of
+from foretrace.predictor import load_imaginer
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
 ASSETS = Path(ft.__file__).parent / "assets/example"
@@ -77,6 +81,19 @@ def test_the_object_moves_in_the_animation(example: tuple[Path, str, str]) -> No
     angles = 2 * np.degrees(np.arctan2(np.linalg.norm(turned[:, 1:], axis=1), np.abs(turned[:, 0])))
     assert angles[0] < 0.1
     assert 30 < angles[-1] < 70
+
+
+def test_the_simulated_object_moves_and_the_prediction_beside_it() -> None:
+    prism = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)])
+    action = ft.LeverUp.at_edge(prism, 2, 0.4)
+    imagined = load_imaginer().imagine(ft.TopDownView.of(prism, action), action)
+    truth = simulate_lever_up(prism, action, SimulationConfig(embodiment="tool"))
+    scene = scene_of(prism, action, imagined, "one-shot", truth)
+    np.testing.assert_array_equal(scene.pose, truth.effect.pose_trajectory)
+    (ghost,) = scene.ghosts
+    assert np.linalg.norm(ghost.pose[-1, :3] - scene.pose[-1, :3]) < 0.01
+    alone, beside = (next(animation.frames(replace(scene, ghosts=each))) for each in ((), scene.ghosts))
+    assert np.count_nonzero((alone != beside).any(axis=2)) > 200
 
 
 def test_poses_of_the_object_are_those_of_its_frame() -> None:

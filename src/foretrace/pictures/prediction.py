@@ -75,11 +75,11 @@ def scene_of(
         scene = replace(
             Scene.observed(truth, paths), title=f"Predicted and simulated lever-up: {truth.effect.outcome}"
         )
-        ghosts = [] if pose is None else [Ghost(pose, color, 1)]
+        ghosts = [] if pose is None else [Ghost(pose, color, 1.0)]
     else:
         scene = Scene.imagined(obj, action, imagined.times, paths, pose)
         if not imagined.futures.is_point:
             outcome, chance = max(imagined.futures.outcomes().items(), key=lambda item: item[1][0])
             scene = replace(scene, title=f"{scene.title}: {outcome} {percentage(float(chance[0]))}")
-        ghosts = [Ghost(motion, color, 1) for motion in other_motions(imagined, placement)]
+        ghosts = [Ghost(motion, color, 1.0) for motion in other_motions(imagined, placement)]
     return replace(scene, band=prediction_band(imagined), ghosts=ghosts)
