@@ -46,12 +46,14 @@ audit: setup
 licences: setup
 	$(BIN)/python .ci/licences.py > docs/results/licences.md
 
-# What a release consists of, checked as a package host would.
+# What a release consists of, checked as a package host would. URL is the address below which the repository's files are
+# served: README's links and pictures then work in the description, too.
 dist: setup
 	test -d .venv/dist || $(PYTHON) -m venv .venv/dist
 	.venv/dist/bin/pip install --quiet build twine
 	rm -rf dist
-	.venv/dist/bin/python -m build --quiet --outdir dist
+	FORETRACE_URL=$(URL) .venv/dist/bin/python -m build --outdir dist > dist.log 2>&1 || { cat dist.log; exit 1; }
+	rm dist.log
 	.venv/dist/bin/twine check --strict dist/*
 	ls -l dist
 

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from foretrace.errors import CheckpointError
 from foretrace.extras import EXTRA_OF, MissingExtraError, missing_extra, named_extras
 from foretrace.objects import sample_prism
 from foretrace.planning.candidates import Scene
-from foretrace.predictor import OnnxPredictor, load_imaginer, load_predictor
+from foretrace.predictor import LstmPredictor, OnnxPredictor, load_imaginer, load_predictor
 from foretrace.predictor.loading import PORTABLE, default_checkpoint
 
 ROOT = Path(__file__).parents[1]
@@ -179,6 +180,41 @@ def test_files_that_are_no_predictor_are_refused(tmp_path: Path) -> None:
     for file, message in ((tmp_path / "none.onnx", "does not exist"), (cut, "cannot be read")):
         with pytest.raises(CheckpointError, match=message):
             OnnxPredictor(file)
+
+
+def test_a_folder_for_a_hub_is_read_again(tmp_path: Path) -> None:
+    predictor = load_predictor()
+    predictor.save_pretrained(tmp_path / "hub")
+    files = {file.name for file in (tmp_path / "hub").iterdir()}
+    assert files == {"README.md", "config.json", "model.safetensors"}
+    card = (tmp_path / "hub/README.md").read_text(encoding="utf-8")
+    assert card.startswith("---\nlibrary_name: foretrace\n")
+    assert "| Weights | 751,410 |" in card
+    again = ft.EffectPredictor.from_pretrained(tmp_path / "hub")
+    assert again.learned_from == predictor.learned_from
+    assert again.ranges == predictor.ranges
+    for name, tensor in predictor.state_dict().items():
+        assert tensor.equal(again.state_dict()[name])
+    with pytest.raises(CheckpointError, match=r"one-shot', no LstmPredictor: take OneShotPredictor"):
+        LstmPredictor.from_pretrained(tmp_path / "hub")
+    with pytest.raises(CheckpointError, match="give the folder of a trained predictor"):
+        ft.EffectPredictor.from_pretrained(tmp_path)
+    (tmp_path / "hub/README.md").write_text("own")
+    predictor.save_pretrained(tmp_path / "hub")
+    assert (tmp_path / "hub/README.md").read_text() == "own"
+
+
+def test_the_description_has_absolute_links() -> None:
+    spec = spec_from_file_location("description", ROOT / ".ci/description.py")
+    assert spec is not None
+    assert spec.loader is not None
+    description = module_from_spec(spec)
+    spec.loader.exec_module(description)
+    given = "![a](docs/a.png) [b](https://b.org/c) [d](#e) [f](docs/g.md#h)"
+    wanted = "![a](https://u.org/m/docs/a.png) [b](https://b.org/c) [d](#e) [f](https://u.org/m/docs/g.md#h)"
+    assert description.absolute(given, "https://u.org/m/") == wanted
+    text = description.absolute((ROOT / "README.md").read_text(encoding="utf-8"), "https://u.org")
+    assert not re.findall(r"\]\((?!https:|#)", text)
 
 
 def test_other_failed_imports_stay_what_they_are() -> None:

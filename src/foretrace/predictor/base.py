@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
@@ -10,8 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
-from foretrace.errors import TrainingError, shown
+from foretrace.errors import CheckpointError, TrainingError, shown
 from foretrace.features import Precision
+from foretrace.files import as_path
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes, Start
 from foretrace.imagined.context import CONSTANTS
 from foretrace.imagined.domain import Ranges, find_unusual
@@ -204,6 +206,41 @@ class EffectPredictor(Imaginer, nn.Module):
         return TracedTrajectory(self)
 
     # --- final --------------------------------------------------------------------------------------------
+
+    @final
+    def save_pretrained(self, path: str | Path) -> None:
+        """Write ``config.json``, ``model.safetensors`` and a card, ``README.md``, into a folder, as model hubs have it.
+
+        Args:
+            path: The folder; made if it does not exist. A card that it has is kept.
+
+        Raises:
+            CheckpointError: The folder cannot be made.
+        """
+        from foretrace.predictor.hub import save_pretrained
+
+        save_pretrained(self, path)
+
+    @final
+    @classmethod
+    def from_pretrained(cls, path: str | Path) -> "EffectPredictor":
+        """Read a predictor from a folder that `save_pretrained` or a training wrote; nothing is fetched.
+
+        Args:
+            path: The folder.
+
+        Raises:
+            CheckpointError: A file is missing or damaged, tensors do not fit, or it is a predictor of another class.
+        """
+        from foretrace.predictor.checkpoint import read_predictor
+
+        found = read_predictor(as_path(path, CheckpointError))
+        if not isinstance(found, cls):
+            raise CheckpointError(
+                f"{path} is a predictor {shown(found.label)}, no {cls.__name__}: take "
+                f"{type(found).__name__}.from_pretrained"
+            )
+        return found
 
     @final
     @property
