@@ -19,6 +19,7 @@ class Visitor:
         self.controls: dict[str, dict[str, Any]] = {}
         self.nodes: dict[str, dict[str, Any]] = {}
         self.downloads: list[str] = []
+        self.drawn = 0
         self.owner = ""
         protocols = [f"viser-v{viser.__version__}"]
         self._open = ExitStack()
@@ -68,11 +69,17 @@ class Visitor:
     def drag(self, x: float, y: float, name: str = "/grip", modifier: str | None = None) -> None:
         """Drag a thing to a point of the table."""
         for phase in ("start", "update", "end"):
-            self._send(
-                "SceneNodeDragMessage", phase=phase, name=name, instance_index=None, start_position=(0.0, 0.0, 0.0),
-                start_screen_pos=(0.0, 0.0), end_position=(x, y, 0.0), end_screen_pos=(0.0, 0.0), button="left",
-                modifier=modifier, owner=self.owner,
-            )  # fmt: skip
+            self.move(x, y, phase, name, modifier)
+
+    def move(
+        self, x: float, y: float, phase: str = "update", name: str = "/grip", modifier: str | None = None
+    ) -> None:
+        """Be in the midst of dragging a thing, with the pointer at a point of the table."""
+        self._send(
+            "SceneNodeDragMessage", phase=phase, name=name, instance_index=None, start_position=(0.0, 0.0, 0.0),
+            start_screen_pos=(0.0, 0.0), end_position=(float(x), float(y), 0.0), end_screen_pos=(0.0, 0.0),
+            button="left", modifier=modifier, owner=self.owner,
+        )  # fmt: skip
 
     def press(self, x: float, y: float) -> None:
         """Click a point of the table."""
@@ -122,6 +129,7 @@ class Visitor:
             self.nodes.pop(message["name"], None)
         elif "name" in message and "props" in message:
             self.nodes[message["name"]] = {"type": kind, **message["props"]}
+            self.drawn += message["name"] == "/path0"  # comes after the tube, and all that is expected
             self.owner = message.get("owner") or self.owner
         elif kind in ("SetPositionMessage", "SetOrientationMessage") and message["name"] in self.nodes:
             self.nodes[message["name"]].update(

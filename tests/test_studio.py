@@ -336,6 +336,8 @@ def test_a_visitor_watches_and_saves(served):
         visitor.set("what goes wrong", "freeze")
         visitor.click("watch")
         visitor.look(lambda: "score" in visitor.verdict, 20)
+        visitor.set("play", False)
+        visitor.look(seconds=0.3)
         visitor.set("time [s]", visitor.controls[visitor.find("time [s]")]["max"])
         visitor.look(lambda: "tracker frozen" in visitor.verdict)
         visitor.click("the same in Python")

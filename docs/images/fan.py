@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.cli.futures import percentage
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix
+from foretrace.imagined.shown import percentage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
 from foretrace.pictures.animation import interaction_animation

@@ -20,7 +20,7 @@ from foretrace.studio.saving import animation, picture, plan_file, python_lines
 from foretrace.studio.scenery import Moving, futures_of, observed_motion, shown_times
 from foretrace.studio.session import LEVEL, Session
 from foretrace.studio.shapes import MOST_CORNERS, checked, example, from_file, from_text, prism_of
-from foretrace.studio.stage import Stage
+from foretrace.studio.stage import LOOK_AT, Stage
 
 FRAME = 1 / 25
 """Time between two pictures while time runs [s]."""
@@ -60,6 +60,11 @@ class Page:
         self.act(lambda: None, message)
         self._player = Thread(target=self._let_time_run, daemon=True, name="foretrace-studio-time")
         self._player.start()
+
+    def show_from(self, eye: tuple[float, float, float]) -> None:
+        """Look at the object from a place in its frame [m]."""
+        self._client.camera.position = eye
+        self._client.camera.look_at = LOOK_AT
 
     def close(self) -> None:
         """The visitor has gone."""
@@ -186,7 +191,7 @@ class Page:
         self._drawn = [] if begins else None
         controls.draw.visible = not begins
         controls.drawn.visible = controls.undraw.visible = begins
-        self.stage.hide_object(begins)
+        self.stage.clear(begins)
         self.stage.show_drawing(np.zeros((0, 2)))
         self._client.scene.remove_click_callback("all")
         if begins:

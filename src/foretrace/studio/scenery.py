@@ -128,26 +128,32 @@ def tube(path: Float[np.ndarray, "time 3"], radius: Float[np.ndarray, " time"]) 
         )
     tangents = np.gradient(centres, axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-    side = np.cross(tangents[0], [0.0, 0.0, 1.0] if abs(tangents[0, 2]) < 0.9 else [1.0, 0.0, 0.0])
-    angles = 2 * np.pi * np.arange(SIDES) / SIDES
-    rings, caps = [], np.array([0.15, 0.6, 0.9])
-    for k, (centre, ahead) in enumerate(zip(centres, tangents, strict=True)):
+    sides = np.empty_like(tangents)
+    side = np.cross(tangents[0], np.array([0.0, 0.0, 1.0] if abs(tangents[0, 2]) < 0.9 else [1.0, 0.0, 0.0]))
+    for k, ahead in enumerate(tangents):
         side = side - (side @ ahead) * ahead  # carried along without twist
-        side = side / max(float(np.linalg.norm(side)), 1e-12)
-        around = np.outer(np.cos(angles), side) + np.outer(np.sin(angles), np.cross(ahead, side))
-        steps = [(0.0, 1.0)]
-        if k == 0:
-            steps = [(-float(np.sqrt(1 - share**2)), float(share)) for share in caps] + steps
-        if k == len(centres) - 1:
-            steps += [(float(np.sqrt(1 - share**2)), float(share)) for share in caps[::-1]]
-        rings += [centre + wide[k] * (back * ahead + share * around) for back, share in steps]
+        side = sides[k] = side / max(float(np.sqrt(side @ side)), 1e-12)
+    angles = 2 * np.pi * np.arange(SIDES) / SIDES
+    around = (
+        np.cos(angles)[:, None] * sides[:, None]
+        + np.sin(angles)[:, None] * np.cross(tangents, sides)[:, None]
+    )
+    # Rings along the path, and smaller ones beyond its ends.
+    share = np.array([0.15, 0.6, 0.9])
+    beyond = np.sqrt(1 - share**2)
+    count = len(centres)
+    which = np.concatenate([[0] * 3, np.arange(count), [count - 1] * 3])
+    back = np.concatenate([-beyond, np.zeros(count), beyond[::-1]])
+    small = np.concatenate([share, np.ones(count), share[::-1]])
+    offsets = back[:, None, None] * tangents[which][:, None] + small[:, None, None] * around[which]
+    rings = centres[which][:, None] + wide[which][:, None, None] * offsets
     here = np.arange(SIDES)
     after = np.roll(here, -1)
     quads = np.concatenate(
         [np.column_stack([here, after, after + SIDES]), np.column_stack([here, after + SIDES, here + SIDES])]
     )
     faces = np.concatenate([quads + SIDES * k for k in range(len(rings) - 1)])
-    return np.concatenate(rings), faces
+    return rings.reshape(-1, 3), faces
 
 
 def rim_segments(

@@ -38,6 +38,10 @@ CAMERA, LOOK_AT = (0.14, -0.3, 0.22), (0.0, 0.0, 0.02)
 """Where the camera is at first, and what it looks at [m]."""
 TABLE_SIZE = (0.9, 0.9, 0.012)
 """The table [m]."""
+WIDE = 0.05
+"""Of futures beside the expected one, wider tubes are left out: they would hide everything [m]."""
+LABEL = 0.022
+"""Distance of labels [m]."""
 RIM = 0.006
 """Thickness of the coloured rim [m]."""
 SHRUNK = 0.985
@@ -65,6 +69,7 @@ class Stage:
         self._movers: dict[str, tuple[Any, Moving]] = {}
         self._ghosts: list[Any] = []
         self._object: Any = None
+        self._rim: RimCost | None = None
         self._tool_poses = np.zeros((0, 4, 4))
         self._times = np.zeros(0)
         client.camera.position, client.camera.look_at = CAMERA, LOOK_AT
@@ -144,15 +149,17 @@ class Stage:
             name = "/object" if k == 0 else f"/ghost{k}"
             future = futures[k] if k < len(futures) else None
             self._put(name, future)
-            if future is None or future.radius is None or not tubes:
+            wide = future is not None and future.radius is not None and k > 0 and future.radius.max() > WIDE
+            if future is None or future.radius is None or wide or not tubes:
                 self._remove(f"/tube{k}")
             else:
                 vertices, faces = tube(future.path, future.radius)
-                self._mesh(f"/tube{k}", vertices, faces, colour_of(future.outcome), 0.14 if k else 0.3)
+                opacity = 0.3 if k == 0 and future.radius.max() < WIDE else 0.13
+                self._mesh(f"/tube{k}", vertices, faces, colour_of(future.outcome), opacity)
             self._path(f"/path{k}", future)
             if future is not None and k > 0:
                 self._scene.get_handle_by_name(name).color = colour_of(future.outcome)
-            self._label(f"/label{k}", future if len(futures) > 1 else None)
+        self._show_labels(futures if len(futures) > 1 else [])
 
     def show_other(self, name: str, moving: Moving | None) -> None:
         """The motion of the ``twin``, or the ``simulated`` one; None: none."""
@@ -161,6 +168,9 @@ class Stage:
 
     def show_rim(self, rim: RimCost | None) -> None:
         """Cost of each contact around the object; None: no rim."""
+        if rim is self._rim:
+            return
+        self._rim = rim
         if rim is None:
             self._remove("/rim")
             return
@@ -179,11 +189,17 @@ class Stage:
             lines = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
             self._scene.add_line_segments("/drawing/lines", lines, ink, thickness=2 * LINE)
 
-    def hide_object(self, hidden: bool) -> None:
+    def clear(self, cleared: bool) -> None:
         """Clear the table while an outline is drawn."""
         for name in ("/object", "/rest", "/tool", "/grip", "/arrow"):
             if (handle := self._scene.get_handle_by_name(name)) is not None:
-                handle.visible = not hidden
+                handle.visible = not cleared
+        if cleared:
+            self.show_futures([], tubes=False)
+            for other in ("twin", "simulated"):
+                self.show_other(other, None)
+            self.show_rim(None)
+            self._scene.get_handle_by_name("/object").visible = False
 
     # --- when ----------------------------------------------------------------------------------------------
 
@@ -230,13 +246,21 @@ class Stage:
         lines = np.stack([moving.path[:-1], moving.path[1:]], axis=1)
         self._scene.add_line_segments(name, lines, colour or colour_of(moving.outcome), thickness=1.5 * LINE)
 
-    def _label(self, name: str, moving: Moving | None) -> None:
-        if moving is None:
-            self._remove(name)
-            return
-        place = moving.path[-1] + np.array([0.0, 0.0, 0.012])
-        text = f"{moving.outcome} {moving.probability:.0%}"
-        self._scene.add_label(name, text, position=place, anchor="bottom-center", font_screen_scale=0.9)
+    def _show_labels(self, futures: Sequence[Moving]) -> None:
+        """What becomes of the object in each future, at the end of its path, or above another label there."""
+        places: list[np.ndarray] = []
+        for future in futures:
+            place = future.path[-1] + np.array([0.0, 0.0, LABEL / 2])
+            while any(np.linalg.norm(place - other) < LABEL for other in places):
+                place = place + np.array([0.0, 0.0, LABEL / 4])
+            places.append(place)
+        for k in range(MOST_FUTURES):
+            self._remove(f"/label{k}")
+            if k < len(futures):
+                text = f"{futures[k].outcome} {futures[k].probability:.0%}"
+                self._scene.add_label(
+                    f"/label{k}", text, position=places[k], anchor="bottom-center", font_screen_scale=0.9
+                )
 
     def _remove(self, name: str) -> None:
         if (handle := self._scene.get_handle_by_name(name)) is not None:
