@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from foretrace.actions import Action, LeverUp, ToolPath
+    from foretrace.actions import Action, LeverUp, Push, PushPath, ToolPath
     from foretrace.errors import ForetraceError
     from foretrace.features import FeatureExtractor
     from foretrace.imagined import Belief, ObservedMotion
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "foretrace.actions": ("Action", "LeverUp", "ToolPath"),
+    "foretrace.actions": ("Action", "LeverUp", "Push", "PushPath", "ToolPath"),
     "foretrace.errors": ("ForetraceError",),
     "foretrace.imagined": ("Belief", "ObservedMotion"),
     "foretrace.interactions.batch": ("InteractionBatch",),
@@ -102,6 +102,8 @@ __all__ = [
     "PlanConfig",
     "PredictorConfig",
     "Prism",
+    "Push",
+    "PushPath",
     "SimulationConfig",
     "ToolPath",
     "TopDownView",

@@ -19,6 +19,7 @@ from foretrace.actions.lever_up import (
 )
 from foretrace.actions.lever_up_judge import Outcome
 from foretrace.actions.motion import FAILED, Judgement, Motion, tool_poses, tool_transforms
+from foretrace.actions.push import Push, PushOutcome, PushPath, sample_pushes
 from foretrace.actions.tool import TOOLS, Rod, Screwdriver, Tool, ToolPart
 
 __all__ = [
@@ -34,6 +35,9 @@ __all__ = [
     "LeverUp",
     "Motion",
     "Outcome",
+    "Push",
+    "PushOutcome",
+    "PushPath",
     "Rod",
     "Screwdriver",
     "Tool",
@@ -43,6 +47,7 @@ __all__ = [
     "minimum_jerk",
     "plane_vector",
     "sample_contacts",
+    "sample_pushes",
     "sample_reachable_contacts",
     "tool_poses",
     "tool_transforms",

@@ -73,6 +73,8 @@ class Tool(ABC):
 
     label: ClassVar[str]
     """Name in records."""
+    touch_margin: ClassVar[float] = 0.0
+    """In MuJoCo the tool acts as if it were thicker by this [m]."""
     length: float
     """Distance from the tip to the end in the holder [m]."""
 
@@ -115,6 +117,7 @@ class Screwdriver(Tool):
     """
 
     label = "screwdriver"
+    touch_margin = 0.001  # a thin blade that comes under a rim is felt in time
     blade_width: float = 0.0055
     """Width of the blade [m]."""
     blade_thickness: float = 0.001

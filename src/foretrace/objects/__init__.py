@@ -7,6 +7,7 @@ from foretrace.objects.flat import (
     sample_rounded,
     sample_sized_prism,
 )
+from foretrace.objects.footed import FOOTINGS, Footed
 from foretrace.objects.mesh import MeshObject
 from foretrace.objects.model import (
     BEVEL,
@@ -37,6 +38,7 @@ __all__ = [
     "BEVEL",
     "CIRCLE_RADIUS",
     "CORNER_COUNTS",
+    "FOOTINGS",
     "NO_BEVEL",
     "OBJECTS",
     "Bevel",
@@ -44,6 +46,7 @@ __all__ = [
     "CollisionShape",
     "Cylinder",
     "CylinderShape",
+    "Footed",
     "HullShape",
     "MassProperties",
     "MeshObject",

@@ -20,7 +20,6 @@ from foretrace.simulation.engine import (
     check_divides,
     sample_tool,
 )
-from foretrace.simulation.tool import TOUCH_MARGIN
 
 
 def play_freely(
@@ -43,6 +42,10 @@ def play_freely(
         poses.append(world.centred_pose(thing))
         velocities[i] = world.velocity(thing)
     return world.to_object_frame(thing, poses), velocities
+
+
+TOUCH_MARGIN = 0.001
+"""Tool and object closer than this touch [m]."""
 
 
 class BulletEngine(Engine):

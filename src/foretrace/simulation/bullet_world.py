@@ -26,6 +26,7 @@ from foretrace.geometry import (
 )
 from foretrace.objects import CollisionShape, CylinderShape, HullShape
 from foretrace.objects.body import Body
+from foretrace.objects.footed import convex_union
 from foretrace.simulation.scene import TABLE_HEIGHT, TABLE_SIZE, TABLE_THICKNESS
 
 COLLISION_MARGIN = 2e-5
@@ -37,8 +38,6 @@ BOUNCE_SPEED = 0.01
 """Slower impacts do not bounce [m/s]."""
 TOOL_MASS = 1e6
 """So heavy that no object disturbs the tool's path [kg, kg m^2]."""
-CONVEX_TOLERANCE = 1e-6
-"""Pieces whose hull has no more than their volume, to this share, are one convex body."""
 
 
 class Client:
@@ -239,21 +238,13 @@ class World:
                 collisionFramePosition=pose[:3].tolist(),
                 collisionFrameOrientation=pose[[4, 5, 6, 3]].tolist(),
             )
-        together = _convex_union(hulls)
+        together = convex_union(hulls)
         if together is not None:
             return b.createCollisionShape(b.GEOM_MESH, vertices=together.tolist())
         # Only a file can hold several hulls. Bullet reads it once more when the body is made.
         file = folder / "pieces.obj"
         file.write_text(_wavefront(hulls), encoding="ascii")
         return b.createCollisionShape(b.GEOM_MESH, fileName=str(file))
-
-
-def _convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:
-    """The corners of the pieces' union if it is convex: one hull has no seams for a blade to catch on."""
-    points = np.unique(np.concatenate(pieces), axis=0)
-    whole = ConvexHull(points)
-    volume = sum(ConvexHull(piece).volume for piece in pieces)
-    return points[whole.vertices] if whole.volume <= volume * (1 + CONVEX_TOLERANCE) else None
 
 
 def _wavefront(pieces: list[Float[np.ndarray, "_ 3"]]) -> str:

@@ -12,8 +12,6 @@ from foretrace.simulation.engine import COORDINATES
 TABLE_BIT, OBJECT_BIT, TOOL_BIT = 1, 2, 4
 """Collision groups: the object meets table and tool; tool and arm meet only the object."""
 TOOL_COLLISION = {"contype": TOOL_BIT, "conaffinity": OBJECT_BIT}
-TOUCH_MARGIN = 0.001
-"""Tool and object closer than this touch [m], and push: the tool acts as if it were thicker by this."""
 TOOL_BODY = "tool_parts"
 """Name of the body that holds a tool's parts."""
 CARRIAGE_INERTIA = (100.0, 1.0)
@@ -42,7 +40,7 @@ def add_tool(
     body.add_site(name="tip")
     # MuJoCo would take the larger friction of two geoms; the priority makes the tool's own count.
     surface = {"friction": [friction, 0.005, 0.0001], "priority": 1, **TOOL_COLLISION}
-    surface |= {"margin": TOUCH_MARGIN, "gap": TOUCH_MARGIN}
+    surface |= {"margin": tool.touch_margin, "gap": tool.touch_margin}
     for part in tool.parts():
         if part.shape == "box":
             shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "pos": [*part.start], "size": [*part.end]}
