@@ -1,4 +1,4 @@
-"""Add an action of your own, a push with a rod, and record it: python examples/own_action.py FOLDER."""
+"""Add an action of your own, a nudge with a rod, and record it: python examples/own_action.py FOLDER."""
 
 import sys
 from dataclasses import dataclass, field
@@ -11,16 +11,16 @@ from foretrace.simulation.recipes import RECIPES, Families
 
 
 @dataclass(frozen=True)
-class PushPath:
+class NudgePath:
     distance: float = 0.06  # past the contact [m]
     height: float = 0.008  # of the rod's tip above the table [m]
     speed: float = 0.08  # mean speed [m/s]
 
 
 @dataclass(frozen=True, eq=False)
-class Push(ft.Action):
-    label, outcomes = "push", ("pushed", "toppled", "missed")
-    path: PushPath = PushPath()
+class Nudge(ft.Action):
+    label, outcomes = "nudge", ("nudged", "toppled", "missed")
+    path: NudgePath = NudgePath()
     tool: Rod = field(default_factory=Rod)
 
     @property
@@ -36,21 +36,21 @@ class Push(ft.Action):
 
     def judge(self, motion: Motion, obj: ft.Prism, com: np.ndarray) -> Judgement:
         shift, rise = np.linalg.norm(com[-1] - com[0]), com[-1, 2] / com[0, 2]
-        return Judgement("missed" if shift < 0.005 else "toppled" if rise > 1.1 else "pushed")
+        return Judgement("missed" if shift < 0.005 else "toppled" if rise > 1.1 else "nudged")
 
     def parameters(self) -> dict[str, float]:
         return {"distance": self.path.distance, "speed": self.path.speed}
 
 
-class Pushes(Families):  # of the paper's objects, where it levers them
-    def make(self, seed: int, object_index: int, per_edge: int) -> tuple[ft.Prism, list[Push]]:
+class Nudges(Families):  # of the paper's objects, where it levers them
+    def make(self, seed: int, object_index: int, per_edge: int) -> tuple[ft.Prism, list[Nudge]]:
         obj, lever_ups = super().make(seed, object_index, per_edge)
-        return obj, [Push(each.contact, each.direction) for each in lever_ups]
+        return obj, [Nudge(each.contact, each.direction) for each in lever_ups]
 
 
 if __name__ == "__main__":
-    RECIPES.add("pushes", Pushes(("prism",)))  # in a package: an entry point of the group foretrace.recipes
-    config = ft.CollectConfig(1, 1, 0, ft.SimulationConfig(embodiment="tool"), "pushes")
+    RECIPES.add("nudges", Nudges(("prism",)))  # in a package: an entry point of the group foretrace.recipes
+    config = ft.CollectConfig(1, 1, 0, ft.SimulationConfig(embodiment="tool"), "nudges")
     ft.collect(config, sys.argv[1], workers=1)
     for stored in ft.Dataset.open(sys.argv[1]):
         same = np.array_equal(ft.replay(stored).effect.com_trajectory, stored.effect.com_trajectory)

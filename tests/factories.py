@@ -3,20 +3,23 @@
 Each object turns rigidly about the closed-form support edge, so that there is something to learn.
 """
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, ToolPath, sample_pushes
 from foretrace.geometry import continuous_quaternions, matrix_to_pose
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.interactions.pushes import PushedShape, RecordedPushes, turned
 from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import TopDownView
-from foretrace.objects import ObjectModel, sample_prism
+from foretrace.objects import NO_BEVEL, ObjectModel, Prism, sample_prism
 from foretrace.simulation.collect import CollectConfig, collect, trial
 from foretrace.simulation.randomisation import NOTHING, Randomisation
+from foretrace.twin.sliding import SlidingTwin
 
 SAMPLE_PERIOD = 0.05
 FINAL_TILT = np.radians(40)
@@ -151,3 +154,61 @@ def _turn(start: np.ndarray, end: np.ndarray, angles: np.ndarray) -> np.ndarray:
 def besides_doubt(warnings):
     """Warnings without those about an expected error: predictors of tests have hardly learned."""
     return tuple(line for line in warnings if not line.startswith("an error of"))
+
+
+PUSHED_SHAPES = {
+    "square": [[0.045, 0.045], [-0.045, 0.045], [-0.045, -0.045], [0.045, -0.045]],
+    "triangle": [[0.06, -0.03], [-0.04, 0.06], [-0.04, -0.03]],
+}
+
+
+def write_push_table(
+    folder: Path,
+    count: int,
+    constants: np.ndarray | None = None,
+    farther: float = 0.0,
+    noise: float = 0.0,
+) -> tuple[Path, Path]:
+    """A table of quasi-static pushes of two shapes, and their file.
+
+    Args:
+        folder: Where both go.
+        count: Number of pushes.
+        constants: Those of the world, as a `SlidingTwin` has them; nominal ones by default.
+        farther: All objects end so much farther along the push [m].
+        noise: Standard deviation of recorded positions [m], and of angles for a radius of 5 cm.
+    """
+    rng = np.random.default_rng(5)
+    shapes = {
+        name: {"outline": outline, "thickness": 0.013, "mass": 0.8} for name, outline in PUSHED_SHAPES.items()
+    }
+    plates = [
+        PushedShape(name, Prism(outline, 0.013, NO_BEVEL), 0.8) for name, outline in PUSHED_SHAPES.items()
+    ]
+    which = np.arange(count) % len(plates)
+    before = np.column_stack([rng.uniform(-0.2, 0.2, (count, 2)), rng.uniform(-3, 3, count)])
+    rod = np.zeros((count, 2, 2))
+    for row in range(count):
+        push = sample_pushes(plates[which[row]].model, rng, 1)[0]
+        start = push.contact - (push.path.approach + push.tool.radius) * push.direction
+        ends = np.stack([start, start + 0.03 * push.direction])
+        rod[row] = before[row, :2] + turned(ends, np.full(2, before[row, 2]))
+    tips = np.round(rod, 6)
+    before = np.round(before, 6)
+    speed, lines = np.full(count, 0.02), np.arange(count) + 2
+    pushes = RecordedPushes(tuple(plates), which, ("steel",) * count, speed, before, before, tips, {}, lines)
+    twin = SlidingTwin() if constants is None else SlidingTwin(constants)
+    moved = twin.predict(pushes)
+    moved[:, :2] += farther * pushes.motion / np.linalg.norm(pushes.motion, axis=1)[:, None]
+    moved += noise * rng.standard_normal((count, 3)) * [1, 1, 20]
+    after = before + np.column_stack([turned(moved[:, :2], before[:, 2]), moved[:, 2]])
+    head = ["surface", "shape", "speed_mm_s", "x0", "y0", "theta0", "x1", "y1", "theta1"]
+    head += ["tip_x0", "tip_y0", "tip_x1", "tip_y1"]
+    lines = [",".join(head)]
+    for row in range(count):
+        numbers = [20.0, *before[row], *after[row], *tips[row].ravel()]
+        lines.append(",".join(["steel", plates[which[row]].name, *(f"{value:.6f}" for value in numbers)]))
+    table, file = folder / "pushes.csv", folder / "shapes.json"
+    table.write_text("\n".join(lines) + "\n")
+    file.write_text(json.dumps(shapes))
+    return table, file

@@ -36,12 +36,12 @@ def load_example():
 
 
 EXAMPLE_MODULE = load_example()
-EVERY_ACTION = pytest.mark.parametrize("label", ["lever-up", "push"])
+EVERY_ACTION = pytest.mark.parametrize("label", ["lever-up", "push", "nudge"])
 
 
 def test_every_registered_action_is_tested():
-    assert {"lever-up", "push"} == set(ACTIONS)
-    assert ACTIONS["push"] is EXAMPLE_MODULE.Push
+    assert {"lever-up", "push", "nudge"} == set(ACTIONS)
+    assert ACTIONS["nudge"] is EXAMPLE_MODULE.Nudge
 
 
 def placed(label: str, obj: ObjectModel = SQUARE) -> Action:
@@ -171,9 +171,11 @@ def test_actions_of_ones_own_must_name_their_outcomes():
 
 
 def test_an_outcome_that_was_not_declared_is_an_error(monkeypatch):
-    monkeypatch.setattr(EXAMPLE_MODULE.Push, "outcomes", ("flown",))
-    with pytest.raises(ActionError, match="'push' was judged 'pushed', which is none of its outcomes: flown"):
-        simulate(SQUARE, placed("push"), embodiment="tool")
+    monkeypatch.setattr(EXAMPLE_MODULE.Nudge, "outcomes", ("flown",))
+    with pytest.raises(
+        ActionError, match="'nudge' was judged 'nudged', which is none of its outcomes: flown"
+    ):
+        simulate(SQUARE, placed("nudge"), embodiment="tool")
 
 
 @pytest.mark.parametrize(
@@ -227,14 +229,14 @@ def test_an_engine_of_ones_own_registers_itself():
 
 
 def test_a_data_set_of_another_action(tmp_path):
-    RECIPES.add("pushes", EXAMPLE_MODULE.Pushes(("prism",)))
+    RECIPES.add("nudges", EXAMPLE_MODULE.Nudges(("prism",)))
     try:
-        config = CollectConfig(1, 1, 0, SimulationConfig(embodiment="tool"), "pushes")
+        config = CollectConfig(1, 1, 0, SimulationConfig(embodiment="tool"), "nudges")
         counts = collect(config, tmp_path, workers=1)
     finally:
-        del RECIPES._entries["pushes"]
+        del RECIPES._entries["nudges"]
     dataset = Dataset.open(tmp_path)
-    assert counts == dataset.outcomes() == {"pushed": 3}
+    assert counts == dataset.outcomes() == {"nudged": 3}
     assert examine(tmp_path).findings == ()
     assert len(dataset.where(outcome="pushed", distance=0.06)) == 3
     with pytest.raises(

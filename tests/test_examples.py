@@ -137,7 +137,7 @@ def test_render_scene(tmp_path: Path) -> None:
 
 @WITHOUT_BULLET
 def test_own_action(tmp_path: Path) -> None:
-    printed = run_python(EXAMPLES / "own_action.py", tmp_path / "pushes")
-    moved = re.findall(r"pushed, ([\d.]+) cm in MuJoCo, ([\d.]+) in Bullet; same again: True", printed)
+    printed = run_python(EXAMPLES / "own_action.py", tmp_path / "nudges")
+    moved = re.findall(r"nudged, ([\d.]+) cm in MuJoCo, ([\d.]+) in Bullet; same again: True", printed)
     assert len(moved) == 3
     assert all(abs(float(mujoco) - float(bullet)) < 1 for mujoco, bullet in moved)

@@ -94,6 +94,8 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "identification": lambda root: {"objects": 1},
     "monitoring": lambda root: {"executions": 2, "faults": 1, "parts": ("calibration", "normal", "slip", "freeze")},
     "shipped": lambda root: {"objects": 2, "twin": True},
+    "pushes": lambda root: dict(zip(("pushes", "shapes"), factories.write_push_table(root, 90), strict=True))
+                           | {"methods": ("nearest", "simulation", "learned")},
     "planning": lambda root: {"objects": 1, "families": ("polygon",), "worlds": ("nominal",), "contacts": 16},
     "uncertainty": lambda root: {"data": root / "plain", "seeds": (0,), "splits": ("shuffled",), "samples": 3,
                                  "recipe": QUICK["one-shot"]},

@@ -90,16 +90,10 @@ class PushPath:
         """
         moving = self.length / self.speed
         ramp = min(RAMP, moving)
-        t = np.asarray(times, dtype=float) - self.wait_time
-        return (
-            self.speed
-            / (2 * ramp)
-            * (_square(t) - _square(t - ramp) - _square(t - moving) + _square(t - moving - ramp))
-        )
-
-
-def _square(times: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    return np.maximum(times, 0.0) ** 2
+        t = np.clip(np.asarray(times, dtype=float) - self.wait_time, 0.0, moving + ramp)
+        passed = (np.maximum(t - start, 0.0) ** 2 for start in (0.0, ramp, moving, moving + ramp))
+        begun, fast, slower, ended = passed
+        return self.speed / (2 * ramp) * (begun - fast - slower + ended)
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,7 @@ COMMANDS: dict[str, Entry] = {
     "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
     "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or print its board or markers.", SEE),
     "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),
+    "import-pushes": _command("pushes:import_pushes", "Turn a table of recorded pushes into data.", SEE),
     "film": _command("film:film", "Render a recording of a simulated lever-up.", SEE),
     "capture": _command("capture:capture", "Record with a RealSense camera (experimental).", SEE),
     "overlay": _command("overlay:overlay", "Draw prediction and observation over a recording.", SEE),
@@ -118,6 +119,8 @@ def read(arguments: Sequence[str]) -> Ready:
         SystemExit: Help was asked for and has been printed.
     """
     about = "Predict how an object will move before the robot touches it."
+    if list(arguments[:2]) == ["import", "pushes"]:
+        arguments = ["import-pushes", *arguments[2:]]
     return parse(COMMANDS, arguments, "foretrace", about)
 
 

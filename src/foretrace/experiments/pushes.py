@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from foretrace.errors import ResultsError, is_whole, shown
-from foretrace.evaluation.experiment import Experiment, Row, Trial
+from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.pushes_report import draw_coverage, draw_errors, draw_poses, report_of, summary_of
 from foretrace.files import short_hash
@@ -61,6 +61,11 @@ class Task:
     """Whether the shape to predict is none of those to learn from."""
     seed: int
 
+    @cached_property
+    def twin(self) -> SlidingTwin:
+        """The twin with constants from all pushes to learn from."""
+        return SlidingTwin.identified(self.learn, self.seed)
+
 
 @dataclass(frozen=True)
 class PushTrial(Trial):
@@ -88,6 +93,8 @@ class PushesExperiment(Experiment):
     """Radius of the rod in metres."""
     skip_bad: bool = False
     """Leave out rows that are wrong, and list them."""
+    methods: tuple[str, ...] = ()
+    """Methods that are compared; by default all."""
 
     label = "pushes"
     summary = SUMMARIES["pushes"]
@@ -95,7 +102,8 @@ class PushesExperiment(Experiment):
 
     def trials(self) -> Sequence[PushTrial]:
         """One for each method."""
-        return [PushTrial(name) for name in (*_peers(self._task.test), *METHODS)]
+        known = [*_peers(self._task.test), *METHODS]
+        return [PushTrial(name) for name in chosen("methods", self.methods or known, known)]
 
     def identity(self) -> dict[str, Any]:
         """The two files, and the options that decide the split."""
@@ -313,16 +321,11 @@ def _mujoco(task: Task) -> Answer:
 def _identified_from_few(task: Task) -> Answer:
     rng = np.random.default_rng(task.seed)
     few = task.learn[np.sort(rng.permutation(len(task.learn))[:FEW])]
-    return Answer(_twin(few, task).predict(task.test))
+    return Answer(SlidingTwin.identified(few, task.seed).predict(task.test))
 
 
 def _identified(task: Task) -> Answer:
-    twin = _twin(task.learn, task)
-    return _calibrated(task, twin.predict(task.test), twin.predict(task.learn))
-
-
-def _twin(pushes: RecordedPushes, task: Task) -> SlidingTwin:
-    return SlidingTwin.identified(pushes, task.seed)
+    return _calibrated(task, task.twin.predict(task.test), task.twin.predict(task.learn))
 
 
 def _learned(task: Task) -> Answer:
@@ -330,7 +333,7 @@ def _learned(task: Task) -> Answer:
 
 
 def _residual(task: Task) -> Answer:
-    return _fitted(PushResidual(_twin(task.learn, task), task.new_shape, task.seed), task)
+    return _fitted(PushResidual(task.twin, task.new_shape, task.seed), task)
 
 
 def _fitted(model: PushResidual, task: Task) -> Answer:

@@ -11,7 +11,6 @@ from matplotlib.patches import Circle, Polygon
 
 from foretrace.evaluation.charts import finish, grid
 from foretrace.evaluation.tables import markdown_table, number
-from foretrace.imagined import LEVELS
 from foretrace.interactions.pushes import RecordedPushes, turned
 from foretrace.pictures.style import GREY, INK, PREDICTION_COLORS, TOOL_COLOR, TRUTH_COLOR, new_figure, styled
 
@@ -29,6 +28,8 @@ WORDS = {
     "residual": "residual over the twin",
 }
 """Methods in words."""
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""Levels of the regions whose coverage is told."""
 SHOWN = "residual"
 """Method whose predictions are drawn."""
 RESAMPLED = 1000
@@ -72,7 +73,7 @@ def _coverage(part: pd.DataFrame) -> dict[str, dict[str, float]] | None:
         return None
     return {
         f"{level:.0%}": {
-            name: float((part[f"{name}_level"] <= level).mean()) for name in ("position", "rotation")
+            name: float((part[f"{name}_level"] < level).mean()) for name in ("position", "rotation")
         }
         for level in LEVELS
     }
@@ -84,7 +85,7 @@ def report_of(summary: Mapping[str, Any]) -> str:
     lines = []
     for name, each in methods.items():
         covered = each["coverage"]
-        shares = ["–"] if covered is None else [f"{100 * covered[k]['position']:.0f}" for k in covered]
+        shares = ["-"] if covered is None else [f"{100 * covered[k]['position']:.0f}" for k in covered]
         lines.append(
             [
                 WORDS.get(name, name),
@@ -177,7 +178,7 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
         for method, color, style in (("residual", 0, "-"), ("learned", 1, "--"), ("identified", 2, "-.")):
             part = rows[rows["method"] == method]
             if len(part) and part[f"{name}_level"].notna().all():
-                held = [(part[f"{name}_level"] <= level).mean() for level in levels]
+                held = [(part[f"{name}_level"] < level).mean() for level in levels]
                 ax.plot(levels, held, style, color=PREDICTION_COLORS[color], label=WORDS[method])
         ax.plot([0, 1], [0, 1], ":", color=GREY)
         grid(ax, xlabel=f"level of the {name} region", xlim=(0, 1), ylim=(0, 1))

@@ -101,7 +101,7 @@ class RecordedPushes:
     def __len__(self) -> int:
         return len(self.shape)
 
-    def __getitem__(self, rows: np.ndarray) -> "RecordedPushes":
+    def __getitem__(self, rows: slice | list[int] | np.ndarray) -> "RecordedPushes":
         numbers = np.arange(len(self))[rows]
         return RecordedPushes(
             self.shapes,

@@ -11,10 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foretrace.actions import Action, LeverUp, sample_contacts, sample_reachable_contacts
+from foretrace.actions import Action, LeverUp, Push, sample_contacts, sample_pushes, sample_reachable_contacts
 from foretrace.errors import SimulationError
 from foretrace.objects import (
     CORNER_COUNTS,
+    FOOTINGS,
+    NO_BEVEL,
+    Footed,
     ObjectModel,
     Prism,
     sample_dented,
@@ -40,6 +43,8 @@ ROUND_EDGES = 4
 """Number of edges that count for them."""
 SOLID_STREAM = 1
 """Tells the random numbers of the solids from those of prisms with the same number."""
+PUSH_STREAM = 7
+"""Tells the random numbers of pushes from those of the objects."""
 EVERYDAY_STREAM = 3
 """Tells the random numbers of the sized prisms and round objects from those of the others."""
 
@@ -130,6 +135,31 @@ class Families(Recipe):
         return _Place(family, turn, member, self.families.count(family) * turn + member)
 
 
+PUSHED_THICKNESS = 0.013
+"""Thickness of pushed objects [m]."""
+
+
+@dataclass(frozen=True)
+class Pushed(Recipe):
+    """Pushes of flat plates on feet, whose outlines are those of another recipe's objects."""
+
+    shapes: Families
+    """The other recipe; of its objects the outlines count."""
+
+    def count(self, object_index: int, per_edge: int) -> int:
+        """Number of pushes of an object."""
+        return self.shapes.count(object_index, per_edge)
+
+    def make(self, seed: int, object_index: int, per_edge: int) -> tuple[ObjectModel, list[Push]]:
+        """An object and its pushes, all round its outline and within a cone about the inward normal."""
+        model = self.shapes.make(seed, object_index, per_edge)[0]
+        rng = np.random.default_rng(np.random.SeedSequence([seed, object_index, PUSH_STREAM]))
+        plate = Prism(model.corners, PUSHED_THICKNESS, NO_BEVEL)
+        plate = Footed(plate, FOOTINGS[int(rng.integers(len(FOOTINGS)))])
+        return plate, sample_pushes(plate, rng, self.count(object_index, per_edge))
+
+
+RECIPES.add("pushes", Pushed(Families(("prism",) * 3 + tuple(ROUND))))
 RECIPES.add("paper", Families(("prism",)))
 RECIPES.add("solids", Families(("alike",) * LOOK_ALIKES))
 RECIPES.add("mixed", Families(("prism",) * 2 + ("alike",) * LOOK_ALIKES))
