@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from foretrace.errors import ResultsError, is_whole, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
@@ -256,8 +256,8 @@ def _constant(task: Task) -> Answer:
 def _nearest(task: Task) -> Answer:
     """The displacement, as the rod sees it, of the most similar push: by place, direction and shape."""
     learn, test = (_place(pushes, task.new_shape) for pushes in (task.learn, task.test))
-    tree = cKDTree(learn)
-    others = tree.query(learn, k=2)[1][:, 1]
+    tree = KDTree(learn)
+    others = np.asarray(tree.query(learn, k=2)[1])[:, 1]
     nearest = tree.query(test)[1]
     seen = _by_rod(task.learn, task.learn.displacement())
     return _calibrated(
@@ -367,7 +367,7 @@ def repetitions(pushes: RecordedPushes) -> dict[str, float | int]:
     place = np.column_stack(
         [pushes.start, reach * np.cos(direction), reach * np.sin(direction), 10.0 * pushes.shape]
     )
-    pairs = cKDTree(place).query_pairs(SAME_START, output_type="ndarray")
+    pairs = KDTree(place).query_pairs(SAME_START, output_type="ndarray")
     if len(pairs) == 0:
         return {"pairs": 0}
     ends = pushes.displacement()

@@ -53,7 +53,9 @@ def _numbers(part: pd.DataFrame) -> dict[str, Any]:
     found["coverage"] = _coverage(part)
     for column, name in (("shape", "by_shape"), ("speed_mm_s", "by_speed")):
         found[name] = {
-            str(key): {each: float(some[each].mean()) for each in ("position_mm", "rotation_deg")}
+            str(key): {
+                each: float(some[each].to_numpy(float).mean()) for each in ("position_mm", "rotation_deg")
+            }
             | {"pushes": len(some), "coverage": _coverage(some)}
             for key, some in part.groupby(column)
         }
@@ -69,12 +71,11 @@ def _interval(values: np.ndarray) -> list[float]:
 
 def _coverage(part: pd.DataFrame) -> dict[str, dict[str, float]] | None:
     """Share of the pushes that regions of each level hold; None of a method without regions."""
-    if part["position_level"].isna().any():
+    reached = {name: part[f"{name}_level"].to_numpy(float) for name in ("position", "rotation")}
+    if np.isnan(reached["position"]).any():
         return None
     return {
-        f"{level:.0%}": {
-            name: float((part[f"{name}_level"] < level).mean()) for name in ("position", "rotation")
-        }
+        f"{level:.0%}": {name: float((values < level).mean()) for name, values in reached.items()}
         for level in LEVELS
     }
 
@@ -176,9 +177,9 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
     levels = np.linspace(0, 1, 101)
     for ax, name in zip(axes, ("position", "rotation"), strict=True):
         for method, color, style in (("residual", 0, "-"), ("learned", 1, "--"), ("identified", 2, "-.")):
-            part = rows[rows["method"] == method]
-            if len(part) and part[f"{name}_level"].notna().all():
-                held = [(part[f"{name}_level"] < level).mean() for level in levels]
+            reached = rows.loc[rows["method"] == method, f"{name}_level"].to_numpy(float)
+            if len(reached) and not np.isnan(reached).any():
+                held = [(reached < level).mean() for level in levels]
                 ax.plot(levels, held, style, color=PREDICTION_COLORS[color], label=WORDS[method])
         ax.plot([0, 1], [0, 1], ":", color=GREY)
         grid(ax, xlabel=f"level of the {name} region", xlim=(0, 1), ylim=(0, 1))
@@ -191,15 +192,15 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
 @styled
 def draw_poses(rows: pd.DataFrame, test: RecordedPushes) -> Figure:
     """Predicted and recorded poses of pushes of every size of error, the worst included."""
-    part = rows[rows["method"] == SHOWN]
+    part = pd.DataFrame(rows[rows["method"] == SHOWN]).to_dict(orient="records")
     place = {int(line): row for row, line in enumerate(test.line)}
     fig = new_figure(9.6, 7.6)
     axes = fig.subplots(3, 4).ravel()
-    ordered = part.sort_values("position_mm")
-    picks = np.unique(np.linspace(0, max(0, len(ordered) - 1 - WORST), TYPICAL).astype(int))
-    worst = np.arange(max(0, len(ordered) - WORST), len(ordered))
-    chosen = ordered.iloc[np.concatenate([picks, worst])]
-    for ax, (_, each) in zip(axes, chosen.iterrows(), strict=False):
+    ordered = sorted(part, key=lambda each: each["position_mm"])
+    typical = np.linspace(0, max(0, len(ordered) - 1 - WORST), TYPICAL).astype(int)
+    numbers = [*np.unique(typical).tolist(), *range(max(0, len(ordered) - WORST), len(ordered))]
+    chosen = [ordered[k] for k in numbers if k < len(ordered)]
+    for ax, each in zip(axes, chosen, strict=False):
         _draw_pose(ax, each, test, place[int(each["line"])])
     for ax in axes[len(chosen) :]:
         ax.set_axis_off()
@@ -208,7 +209,7 @@ def draw_poses(rows: pd.DataFrame, test: RecordedPushes) -> Figure:
     return fig
 
 
-def _draw_pose(ax: Axes, each: "pd.Series[Any]", test: RecordedPushes, row: int) -> None:
+def _draw_pose(ax: Axes, each: Mapping[str, Any], test: RecordedPushes, row: int) -> None:
     corners, start, motion = test.shapes[test.shape[row]].model.corners, test.start[row], test.motion[row]
     centre = test.shapes[test.shape[row]].centroid
     truth = test.displacement()[row]
