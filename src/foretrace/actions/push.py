@@ -149,12 +149,16 @@ class Push(Action):
 
 PARAMETERS = ("distance", "speed", "approach")
 """Parameters of a push that predictors can be conditioned on."""
+AHEAD = 0.005
+"""The middle of a pushed object lies at least this far ahead of a sampled contact [m]."""
+BEHIND, BESIDE = 0.085, 0.19
+"""The view from above ends a little farther behind and beside the contact than this [m]."""
 WIDEST = np.deg2rad(50.0)
 """Largest angle of a sampled push's direction from the inward normal [rad]."""
 
 
 def sample_pushes(obj: ObjectModel, rng: np.random.Generator, count: int) -> list[Push]:
-    """Pushes uniformly over the length of an outline, within a cone about the inward normal.
+    """Pushes uniformly over the length of an outline, within a cone about the inward normal, inside the view.
 
     Args:
         obj: The object.
@@ -171,6 +175,10 @@ def sample_pushes(obj: ObjectModel, rng: np.random.Generator, count: int) -> lis
         push = head_on.moved(0.0, 0.0, rng.uniform(-WIDEST, WIDEST))
         start = push.contact - (push.path.approach + push.tool.radius) * push.direction
         # At a slanting push beside a corner or in a dent the rod would start inside the object.
-        if shapely.distance(outline, shapely.Point(start)) > push.tool.radius:
+        free = shapely.distance(outline, shapely.Point(start)) > push.tool.radius
+        left = np.array([-push.direction[1], push.direction[0]])
+        behind, beside = (((obj.corners - push.contact) @ axis) for axis in (push.direction, left))
+        middle = (shapely.get_coordinates(outline.centroid)[0] - push.contact) @ push.direction
+        if free and middle > AHEAD and behind.min() > -BEHIND and np.abs(beside).max() < BESIDE:
             pushes.append(push)
     return pushes

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
+from foretrace.actions import ACTIONS
 from foretrace.errors import TrainingError, check_ranges, check_type, fault, shown, wrong_type
 from foretrace.features import FEATURES, FeatureExtractor, Option, make_features
 from foretrace.imagined.context import check_names
@@ -45,6 +46,12 @@ def check_choice(name: str, value: Any, choices: Any) -> None:
         )
 
 
+def known_outcomes() -> list[str]:
+    """Outcomes of all actions, those of the lever-up first."""
+    others = (name for kind in ACTIONS for name in ACTIONS[kind].outcomes)
+    return list(dict.fromkeys([*map(str, Outcome), *others]))
+
+
 def check_outcomes(outcomes: Any) -> None:
     """Refuse what is not one or more names of outcomes.
 
@@ -54,11 +61,11 @@ def check_outcomes(outcomes: Any) -> None:
     several = isinstance(outcomes, tuple | list)
     if not several or not outcomes:
         raise fault(TrainingError, several)(
-            f"outcomes is {shown(outcomes)}: name at least one, of {', '.join(Outcome)}"
+            f"outcomes is {shown(outcomes)}: name at least one, of {', '.join(known_outcomes())}"
         )
     for name in outcomes:
-        if name not in list(Outcome):
-            raise TrainingError(f"unknown outcome {shown(name)}; choose from {', '.join(Outcome)}")
+        if name not in known_outcomes():
+            raise TrainingError(f"unknown outcome {shown(name)}; choose from {', '.join(known_outcomes())}")
         if list(outcomes).count(name) > 1:
             raise TrainingError(f"outcome {shown(name)} is named twice: name it once")
 
