@@ -37,7 +37,7 @@ class Visitor:
     def __exit__(self, *error: object) -> None:
         self._open.close()
 
-    def look(self, until: Callable[[], bool] | None = None, seconds: float = 5.0) -> None:
+    def look(self, until: Callable[[], bool] | None = None, seconds: float = 30.0) -> None:
         """Take in what comes until something is seen, or for a while."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and not (until is not None and until()):

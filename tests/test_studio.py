@@ -339,7 +339,8 @@ def test_a_visitor_watches_and_saves(served):
         visitor.set("play", False)
         visitor.look(seconds=0.3)
         visitor.set("time [s]", visitor.controls[visitor.find("time [s]")]["max"])
-        visitor.look(lambda: "tracker frozen" in visitor.verdict)
+        visitor.look(lambda: "In truth" in visitor.verdict)
+        assert "tracker frozen" in visitor.verdict
         visitor.click("the same in Python")
         visitor.look(lambda: "foretrace_lines.py" in visitor.downloads)
         visitor.set("goal", "move")
