@@ -16,6 +16,7 @@ import trimesh
 from PIL import Image
 
 from foretrace import cli
+from foretrace.cli import demo
 from foretrace.evaluation.metrics import at_times
 from foretrace.pictures import animation
 from foretrace.predictor import Futures, ImaginedBatch
@@ -194,12 +195,17 @@ def test_a_card_is_written_for_a_finished_training(run: Path, data: Path) -> Non
 def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     every_frame = animation.frames
     monkeypatch.setattr(animation, "frames", lambda scene: islice(every_frame(scene), 2))
+    monkeypatch.setattr(demo, "HELD_OUT_CORNERS", (6,))
     small = ["--objects", "8", "--contacts-per-edge", "1", "--epochs", "1", "--min-steps", "1"]
     assert cli.main(["demo", "--out", str(tmp_path), "--workers", "1", *small]) == 0
     printed = capsys.readouterr().out
-    for name in ("interactions.png", "predictions.png", "prediction.gif"):
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert printed.splitlines()[-1] == str(tmp_path / "index.html")
+    names = ("interactions", "predictions", "shipped", "plan-lift", "plan-move", "monitor")
+    for name in (*(f"{name}.png" for name in names), "prediction.gif"):
         assert (tmp_path / name).stat().st_size > 10_000
-        assert str(tmp_path / name) in printed
+        assert f'src="{name}"' in page
+    assert (tmp_path / "runs/one-shot/model.safetensors").is_file()
 
 
 @pytest.mark.slow

@@ -1,14 +1,18 @@
 """The whole job in a few minutes: simulate, learn, predict, compare."""
 
 import time
+from dataclasses import replace
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foretrace.cli.console import print_report
 
 if TYPE_CHECKING:
-    from foretrace.interactions.record import Interaction
+    from foretrace.actions import LeverUp
+    from foretrace.interactions.record import Effect, Interaction
     from foretrace.interactions.topdown import TopDownView
+    from foretrace.objects import Prism
     from foretrace.pictures.scene import Scene
     from foretrace.predictor import EffectPredictor
 
@@ -18,6 +22,27 @@ RACKET_HEIGHT = 0.015
 """Thickness assumed for it [m]."""
 HELD_OUT_CORNERS = (4, 6, 9)
 """Corner counts of the new shapes in the picture."""
+LONGER = 4
+"""Passes and steps of the one-shot predictor's training, times those of the others."""
+SHORT = 0.008
+"""How far the blade is pushed in where an object slips [m]; 0.022 is nominal."""
+PAGE = """\
+<!DOCTYPE html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>foretrace: demo</title>
+<style>
+body {{ margin: 2rem auto; max-width: 70rem; padding: 0 1rem; font-family: sans-serif; color: #22262e }}
+figure {{ margin: 0 0 3rem }}
+figcaption {{ font-weight: bold; margin-bottom: 0.7rem }}
+img {{ max-width: 100%; height: auto }}
+</style>
+<h1>foretrace</h1>
+<p>How objects move when a screwdriver levers them up: predicted before the touch, planned, watched, and learned.</p>
+{figures}
+</html>
+"""
 
 
 def demo(
@@ -29,7 +54,9 @@ def demo(
     workers: int | None = None,
     seed: int = 0,
 ) -> None:
-    """Simulate lever-ups, learn from them, and predict new shapes and a real object's silhouette.
+    """Predict, plan and watch with what comes with foretrace; then simulate lever-ups, learn from them, and compare.
+
+    Ends with one page, index.html, of all pictures.
 
     Args:
         out: Folder for data, trainings and pictures; the same command goes on where an interrupted one stopped.
@@ -45,42 +72,161 @@ def demo(
     from foretrace.evaluation.run import run_experiment
     from foretrace.experiments.predictor import Predictor
     from foretrace.interactions.dataset import Dataset
-    from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.contact_sheet import contact_sheet
     from foretrace.pictures.scene import comparison_figure
-    from foretrace.predictor import LstmConfig, TrainConfig, load_predictor, train_predictor
+    from foretrace.predictor import LstmConfig, OneShotConfig, TrainConfig, load_predictor, train_predictor
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
-    # One thread: two on a core that something else uses would be many times slower.
-    config = TrainConfig(epochs=epochs, min_steps=min_steps, split=None, seed=seed, threads=1)
-    print(f"1. Simulating lever-ups of {objects} objects with a UR10 and a screwdriver")
+    print("1. The predictor that comes with foretrace, and the twin, on shapes that neither has seen")
+    shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}
+    shown["Table-tennis racket"] = _racket()
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = _show_shipped(out, shown)
+    print("2. Plans for two goals")
+    pictures += _show_plans(out, seed)
+    print("3. An execution that goes wrong")
+    pictures += _show_slip(out, seed)
+    print(f"4. Simulating lever-ups of {objects} objects with a UR10 and a screwdriver")
     counts = collect(CollectConfig(objects, contacts_per_edge, seed), out / "data", workers)
     print("   " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     dataset = Dataset.open(out / "data")
     contact_sheet(dataset).savefig(out / "interactions.png")
+    pictures.append(("interactions.png", "Some of the simulated lever-ups"))
 
+    # One thread: two on a core that something else uses would be many times slower.
+    config = TrainConfig(epochs=epochs, min_steps=min_steps, split=None, seed=seed, threads=1)
+    # Its networks are small, and take several times as many steps in the same time.
+    longer = replace(
+        config,
+        epochs=LONGER * epochs,
+        min_steps=LONGER * min_steps,
+        learning_rate=OneShotConfig.training.learning_rate,
+    )
+    trainings = {
+        "no feature": (LstmConfig(features="none"), config),
+        "Im-CNN": (LstmConfig(features="im-cnn"), config),
+        "one-shot": (OneShotConfig(), longer),
+    }
     predictors: dict[str, EffectPredictor] = {}
-    for label, name in (("none", "no feature"), ("im-cnn", "Im-CNN")):
-        print(f"2. Training the LSTM with {name}")
-        run = train_predictor(dataset, LstmConfig(features=label), out / "runs" / label, config)
+    for name, (settings, training) in trainings.items():
+        print(f"5. Training on these: {name}")
+        label = name.replace("no feature", "none").lower()
+        run = train_predictor(dataset, settings, out / "runs" / label, training)
         predictors[name] = load_predictor(run)
         print_report(run_experiment(Predictor(run, out / "data"), console=Console(quiet=True)).report)
-
-    print("3. Predicting shapes and an object that were not in the data, and simulating them")
-    shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}
-    shown["Table-tennis racket"] = _racket()
     scenes = {title: _scene(predictors, title, *interaction) for title, interaction in shown.items()}
     comparison_figure(scenes).savefig(out / "predictions.png")
+    pictures.append(("predictions.png", "Three predictors that learned from these lever-ups alone"))
+    page = write_page(out, pictures)
+    print(f"Done in {time.monotonic() - started:.0f} s. All pictures are on one page:")
+    print(page)
+
+
+Pictures = list[tuple[str, str]]
+"""Files of a folder, each with what it shows."""
+
+
+def _show_shipped(out: Path, shown: "dict[str, tuple[Interaction, TopDownView]]") -> Pictures:
+    """The shipped predictor and the twin beside what is simulated."""
+    from foretrace.pictures.animation import scene_animation
+    from foretrace.pictures.prediction import scene_of
+    from foretrace.pictures.scene import comparison_figure
+    from foretrace.predictor import load_imaginer
+    from foretrace.twin import TwinImaginer
+
+    shipped, twin, scenes = load_imaginer(), TwinImaginer(), {}
+    for title, (interaction, view) in shown.items():
+        obj, action = interaction.object, interaction.action
+        imagined = shipped.imagine(view, action)
+        scene = scene_of(obj, action, imagined, "shipped predictor", interaction)  # pyright: ignore[reportArgumentType]
+        path = twin.imagine(view, action).until(action.duration).com_trajectory
+        scenes[title] = replace(scene, title=title, predictions={**scene.predictions, "twin": path})
+    comparison_figure(scenes).savefig(out / "shipped.png")
     scene_animation(scenes["New shape, 6 corners"], out / "prediction.gif")
-    print(f"Done in {time.monotonic() - started:.0f} s. Look at:")
-    for name, content in (
-        ("interactions.png", "some of the simulated lever-ups"),
-        ("predictions.png", "predicted beside simulated motion"),
-        ("prediction.gif", "one of them as an animation"),
-        ("runs/im-cnn", "the trained predictor, for foretrace predict"),
+    return [
+        ("prediction.gif", "Predicted before the touch (orange) and simulated: path, object and 90 % region"),
+        ("shipped.png", "Predictor and twin beside the simulation, from above and from the side"),
+    ]
+
+
+def _show_plans(out: Path, seed: int) -> Pictures:
+    """Where to lever for two goals."""
+    import numpy as np
+
+    from foretrace.objects import sample_prism
+    from foretrace.pictures.plan import plan_figure
+    from foretrace.planning import goals, plan
+
+    prism = sample_prism(np.random.default_rng([seed, 2]), 6)
+    pictures: Pictures = []
+    for name, goal, what in (
+        ("plan-lift.png", goals.Lift(max_slip=0.05), "Where to lever so that it rises as far as possible"),
+        ("plan-move.png", goals.Move((1.0, 0.0)), "Where to lever so that it moves to the right"),
     ):
-        print(f"  {out / name}  {content}")
+        found = plan(prism, goal)
+        plan_figure(found).savefig(out / name)
+        print(f"   {found.goal}: reached with a probability of {found.reached:.0%}")
+        pictures.append((name, what))
+    return pictures
+
+
+def _show_slip(out: Path, seed: int) -> Pictures:
+    """A monitor watches an object slip that was to be levered: the blade is pushed in less far than commanded."""
+    from foretrace.imagined import Belief
+    from foretrace.interactions.topdown import TopDownView
+    from foretrace.monitoring import Monitor
+    from foretrace.pictures.watched import monitor_figure
+    from foretrace.predictor import load_imaginer
+
+    prism, action, effect = _slip(seed)
+    imagined = load_imaginer().imagine(TopDownView.of(prism, action), action, context=Belief())
+    monitor = Monitor(imagined)
+    verdicts = [
+        monitor.update(float(t), pose) for t, pose in zip(effect.times, effect.pose_trajectory, strict=True)
+    ]
+    title = f"To be levered; {effect.outcome}"
+    monitor_figure(imagined, verdicts, effect.com_trajectory, title).savefig(out / "monitor.png")
+    sure = next((each for each in verdicts if each.outcomes.get(effect.outcome, 0.0) > 0.5), None)
+    print("   not noticed" if sure is None else f"   the monitor knows at {sure.time:.2f} s that it slips")
+    return [("monitor.png", "Watched by a monitor: an object that was to be levered slips")]
+
+
+def _slip(seed: int) -> "tuple[Prism, LeverUp, Effect]":
+    """An object that would be levered; drawn again until it slips where the blade is pushed in less far."""
+    import numpy as np
+
+    from foretrace.actions import LeverUp, ToolPath
+    from foretrace.interactions.record import Outcome
+    from foretrace.objects import sample_prism
+    from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+
+    rng, simulation = np.random.default_rng([seed, 3]), SimulationConfig(embodiment="tool")
+    while True:
+        prism = sample_prism(rng, 6)
+        action = LeverUp.at_edge(prism, int(rng.integers(6)), 0.5)
+        short = replace(action, path=ToolPath(insertion=SHORT))
+        effect = simulate_lever_up(prism, short, simulation).effect
+        if (
+            effect.outcome != Outcome.SLIPPED
+            or effect.slip_index is None
+            or effect.times[effect.slip_index] < 1.2
+        ):
+            continue
+        if simulate_lever_up(prism, action, simulation).effect.outcome == Outcome.LEVERED:
+            return prism, action, effect
+
+
+def write_page(out: Path, pictures: Pictures) -> Path:
+    """One page in HTML with all pictures, beside them."""
+    from foretrace.files import write_text
+
+    figures = "\n".join(
+        f'<figure><figcaption>{escape(what)}</figcaption><img src="{escape(name)}" alt="{escape(what)}"></figure>'
+        for name, what in pictures
+    )
+    write_text(out / "index.html", PAGE.format(figures=figures))
+    return out / "index.html"
 
 
 def _new_shape(num_corners: int, seed: int) -> "tuple[Interaction, TopDownView]":
@@ -120,8 +266,6 @@ def _racket() -> "tuple[Interaction, TopDownView]":
 def _scene(
     predictors: "dict[str, EffectPredictor]", title: str, interaction: "Interaction", view: "TopDownView"
 ) -> "Scene":
-    from dataclasses import replace
-
     from foretrace.pictures.scene import Scene
 
     paths = {name: predictor.imagine(view).com_trajectory for name, predictor in predictors.items()}

@@ -339,7 +339,7 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], period: float) -> Non
     images = [Image.fromarray(picture) for picture in pictures]
     palette = images[len(images) // 2].quantize(COLORS, dither=Image.Dither.NONE)
     found = np.reshape(palette.getpalette() or [], (-1, 3))
-    found[(found > 249).all(axis=1)] = 255  # white was averaged with what is nearly white
+    found[(found > 245).all(axis=1)] = 255  # white was averaged with what is nearly white
     palette.putpalette(found.ravel().tolist())
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [round(1000 * period)] * (len(images) - 1) + [round(1000 * LAST_FRAME_TIME)]

@@ -368,7 +368,8 @@ def comparison_figure(scenes: Mapping[str, Scene]) -> Figure:
         Line2D([], [], color=color, linestyle=style, linewidth=width, label=f"centre of mass, {name}")
         for name, _, color, style, width in next(iter(scenes.values())).paths()
     ]
-    fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=4)
+    handles += [*next(iter(scenes.values())).band.handles(PREDICTION_COLORS[0])][:1]
+    fig.legend(handles=[*handles, support_handle()], loc="outside lower center", ncols=5)
     return fig
 
 
