@@ -1,6 +1,7 @@
 """The service over HTTP: predictions, plans and monitors."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -161,10 +162,11 @@ def test_the_page_and_the_description_need_nothing_from_elsewhere(client):
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setitem(__import__("sys").modules, "fastapi", None)
+    monkeypatch.setitem(sys.modules, "fastapi", None)
+    monkeypatch.delitem(sys.modules, "foretrace.studio.service")
     assert cli.main(["serve"]) == 2
     assert (
-        "fastapi is not installed: install it with `pip install 'foretrace[studio]'`"
+        "this needs fastapi, which is not installed: pip install 'foretrace[studio]'"
         in capsys.readouterr().err
     )
 

@@ -1,6 +1,7 @@
 """The studio: what a visitor chooses, what follows, and the page, driven over viser's protocol without a browser."""
 
 import io
+import sys
 
 import numpy as np
 import pytest
@@ -362,10 +363,11 @@ def test_a_page_ends_with_its_visitor(served):
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "foretrace.studio.server", raising=False)
     assert cli.main(["studio"]) == 2
     assert (
-        "viser is not installed: install it with `pip install 'foretrace[studio]'`" in capsys.readouterr().err
+        "this needs viser, which is not installed: pip install 'foretrace[studio]'" in capsys.readouterr().err
     )
 
 

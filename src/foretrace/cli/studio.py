@@ -1,6 +1,5 @@
 """Commands that serve a page or an interface: studio, serve."""
 
-import importlib
 from pathlib import Path
 
 from foretrace.errors import StudioError
@@ -24,7 +23,6 @@ def studio(
         at: What is chosen at first, as the end of a link that the studio makes.
         dark: Dark page.
     """
-    require("viser")
     from foretrace.interactions.dataset import Dataset
     from foretrace.studio.choices import Choices
     from foretrace.studio.server import StudioServer
@@ -49,26 +47,10 @@ def serve(host: str = "127.0.0.1", port: int = 8000) -> None:
         host: Address to listen at; 0.0.0.0 lets other machines in, whoever they are.
         port: Port to listen at; 0: any that is free.
     """
-    require("fastapi", "uvicorn")
     check_port(port)
     from foretrace.studio.service import serve
 
     serve(host, port)
-
-
-def require(*modules: str) -> None:
-    """Make sure that optional libraries are there.
-
-    Raises:
-        StudioError: One is not installed.
-    """
-    for module in modules:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise StudioError(
-                f"{module} is not installed: install it with `pip install 'foretrace[studio]'`"
-            ) from error
 
 
 def check_port(port: int) -> None:
