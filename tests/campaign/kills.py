@@ -78,7 +78,7 @@ def _reference(name: str, materials: Path) -> dict[str, Any]:
     file = materials / "references" / f"killed {name}.json"
     if not file.is_file():
         file.parent.mkdir(exist_ok=True)
-        folder = materials / "references" / f"{name}-{os.getpid()}"
+        folder = materials / "references" / f"{name}-{uuid.uuid4().hex}"  # several threads may want the same
         runs = []
         for part in ("once", "again"):
             (folder / part / "work").mkdir(parents=True)

@@ -184,7 +184,7 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
         ax.plot([0, 1], [0, 1], ":", color=GREY)
         grid(ax, xlabel=f"level of the {name} region", xlim=(0, 1), ylim=(0, 1))
     axes[0].set_ylabel("share of pushes inside")
-    axes[0].legend(loc="upper left")
+    axes[1].legend(loc="lower right")
     finish(fig, "Regions hold what they promise", "dotted: as promised")
     return fig
 
