@@ -447,3 +447,25 @@ def test_ctrl_c_after_the_work_ends_the_process_without_a_word():
     _, errors = process.communicate(timeout=20)
     assert process.returncode == -signal.SIGINT
     assert errors == ""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_python_would_lose_is_heard(tmp_path, sent):
+    script = tmp_path / "deaf.py"
+    script.write_text(
+        "import os, signal, sys, time\n"
+        "import foretrace.cli as cli\n"
+        "class Deaf:\n"
+        "    def __del__(self):  # exceptions of destructors are ignored\n"
+        f"        os.kill(os.getpid(), {int(sent)})\n"
+        "        sum(range(1000))\n"
+        "def slow():\n"
+        "    Deaf()\n"
+        "    time.sleep(60)\n"
+        "cli.read = lambda arguments: slow\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.exit(cli.main(['slow']))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], timeout=30, capture_output=True, text=True)
+    assert done.returncode == 128 + sent
+    assert "ignored" not in done.stderr

@@ -65,6 +65,8 @@ COMMANDS: dict[str, Entry] = {
 
 KILLED = 128
 """Added to a signal's number, the exit status after it, as in a shell: 130 after Ctrl-C."""
+REPEAT = 0.05
+"""Time after which a signal is repeated whose interrupt was lost [s]."""
 FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG)
 """The system's errors for a disk without space, a used-up quota, and a file longer than it may be."""
 OUTPUT_CLOSED = 141
@@ -84,6 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             number = getattr(signal, name, None)
             if number is not None and signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets it
                 signal.signal(number, _interrupt)
+        sys.unraisablehook = _hear_again
     try:
         try:
             return _run(sys.argv[1:] if arguments is None else arguments)
@@ -160,6 +163,16 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt(number)
+
+
+def _hear_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Repeat a signal whose interrupt was lost, as in a destructor, where Python would go on after a word about it."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    given = lost.exc_value.args if lost.exc_value is not None else ()
+    number = given[0] if given else signal.SIGINT
+    threading.Timer(REPEAT, os.kill, (os.getpid(), number)).start()
 
 
 def _status_of(interrupt: KeyboardInterrupt) -> int:
