@@ -156,7 +156,9 @@ class Page:
             self.session.change(turn=float(np.clip(turn, -LARGEST_TURN, LARGEST_TURN)))
 
     def _take(self, obj: Any) -> None:
-        """Another object."""
+        """Another object; an outline that is being drawn is given up."""
+        if self._drawn is not None:
+            self._draw_outline(False)
         self.session.change(object=obj, along=0.1, turn=0.0)
         self.stage.show_object(obj)
         middle = obj.corners.mean(axis=0)
