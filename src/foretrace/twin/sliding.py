@@ -24,6 +24,8 @@ NAMES = (
 )
 """Logarithm of the rod's friction over the nominal one; logarithms of how wide the weight is spread, 0 for evenly over
 the face; offset of its centre [cm]; offset of the outline in the object frame [mm]; of the rod in the table's [mm]."""
+SPREADS = (1, 2)
+"""Places of the spreads among the values."""
 FRICTION = 0.2
 """Nominal friction coefficient between rod and object."""
 SHARED = np.array([0.4, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
@@ -64,7 +66,8 @@ class SlidingTwin:
     """Predicts where pushes leave their objects, by the quasi-static model."""
 
     shared: Float[np.ndarray, " names"] = field(default_factory=lambda: np.zeros(len(NAMES)))
-    """Values of a shape that was never pushed."""
+    """Values of a shape that was never pushed. How its weight is spread is nominal: shapes differ in that among each other
+    as much as from an even spread."""
     own: dict[Group, Float[np.ndarray, " names"]] = field(default_factory=dict)
     """Values of each shape on its surface."""
 
@@ -102,7 +105,7 @@ class SlidingTwin:
             kept = np.sort(rng.permutation(rows)[:MOST_FITTED])
             own[group] = _fit(pushes[kept], shared, OWN)
             progress()
-        return cls(shared, own)
+        return cls(np.where(np.isin(np.arange(len(NAMES)), SPREADS), 0.0, shared), own)
 
 
 def groups_of(pushes: RecordedPushes) -> dict[Group, np.ndarray]:
