@@ -1,6 +1,7 @@
 """The three-dimensional part of a visitor's page, in viser: table, object, screwdriver, futures, tubes, rim."""
 
 from collections.abc import Sequence
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,7 @@ class Stage:
         self._client = client
         self._scene = client.scene
         self._movers: dict[str, tuple[Any, Moving]] = {}
+        self._moving = RLock()  # time runs in a thread of its own
         self._ghosts: list[Any] = []
         self._object: Any = None
         self._rim: RimCost | None = None
@@ -103,6 +105,10 @@ class Stage:
 
     def show_object(self, obj: ObjectModel) -> None:
         """Another object, at rest."""
+        with self._moving:
+            self._replace_object(obj)
+
+    def _replace_object(self, obj: ObjectModel) -> None:
         self._movers = {}
         for name in (
             "/object",
@@ -208,7 +214,7 @@ class Stage:
         if not len(self._times):
             return
         k = int(np.abs(self._times - time).argmin())
-        with self._client.atomic():
+        with self._moving, self._client.atomic():
             _place(self.tool, self._tool_poses[k])
             for handle, moving in self._movers.values():
                 _place(handle, moving.poses[min(k, len(moving.poses) - 1)])
@@ -220,12 +226,11 @@ class Stage:
         if handle is None:
             return
         handle.visible = moving is not None or name == "/object"
-        if moving is None:
-            self._movers.pop(name, None)
-            if name == "/object":
+        with self._moving:
+            if moving is not None:
+                self._movers[name] = (handle, moving)
+            elif self._movers.pop(name, None) is not None and name == "/object":
                 _place(handle, np.eye(4))
-        else:
-            self._movers[name] = (handle, moving)
 
     def _mesh(self, name: str, vertices: np.ndarray, faces: np.ndarray, colour: Any, opacity: float) -> None:
         self._scene.add_mesh_simple(
