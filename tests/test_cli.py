@@ -230,7 +230,7 @@ def test_the_list_of_commands_has_a_line_for_each(capsys):
     printed = capsys.readouterr().out
     listed = re.findall(r"^  (\S+) +\S.*$", printed, re.MULTILINE)
     assert listed == list(cli.COMMANDS)
-    assert len(listed) == 19
+    assert len(listed) == 20
     assert cli.main([]) == 2
 
 
