@@ -66,8 +66,8 @@ class SlidingTwin:
     """Predicts where pushes leave their objects, by the quasi-static model."""
 
     shared: Float[np.ndarray, " names"] = field(default_factory=lambda: np.zeros(len(NAMES)))
-    """Values of a shape that was never pushed. How its weight is spread is nominal: shapes differ in that among each other
-    as much as from an even spread."""
+    """Values of a shape that was never pushed. How its weight is spread is nominal: shapes differ in that among each
+    other as much as from an even spread."""
     own: dict[Group, Float[np.ndarray, " names"]] = field(default_factory=dict)
     """Values of each shape on its surface."""
 
