@@ -355,7 +355,7 @@ def test_nothing_moves_before_somebody_says_yes(base_file, tmp_path, capsys, mon
         raise reply
 
     def fake_execute(host, legs, kinematics, T_table_base, out, limits, watch, confirm, film, **more):
-        assert more == {"correction": (0.0, 0.0, 0.0), "is_ur10": False}
+        assert more == {"correction": (0.0, 0.0, 0.0), "is_ur10": False, "pose_watch": None}
         assert (host, out, film, watch.timeout) == ("arm", tmp_path / "recording.csv", None, 0.3)
         assert [leg.name for leg in legs] == ["descent", "lever-up", "set-down", "retreat"]
         given.extend(confirm([]) for _ in range(3))

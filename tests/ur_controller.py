@@ -34,6 +34,8 @@ UR10 = {"a": [0.0, -0.612, -0.5723, 0.0, 0.0, 0.0], "d": [0.1273, 0.0, 0.0, 0.16
 UR10E = {"a": [0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0], "d": [0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655]}
 """Published Denavit-Hartenberg parameters [m]; the twists are the same for every UR."""
 TWISTS = [math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0]
+STILL = 0.01
+"""Speed of a joint below which the arm stands still [rad/s]."""
 SAFETY_BITS = {1: 0b1, 3: 0b100, 7: 0b10000000}
 _hosts = itertools.count(2)
 
@@ -47,6 +49,8 @@ class Facts:
     stops: list[str] = field(default_factory=list)
     uploads: int = 0
     joints: list[float] = field(default_factory=list)
+    moved: float = 0.0
+    """When a joint last turned faster than `STILL`, by the monotonic clock [s]."""
 
 
 class RunningController:
@@ -252,7 +256,10 @@ class Controller:
             self._halt("watchdog")
         if self.servoing and not self.stuck:
             share = 1 - math.exp(-PERIOD / self.lag)
-            self.joints = [q + share * (t - q) for q, t in zip(self.joints, self.target, strict=True)]
+            steps = [share * (t - q) for q, t in zip(self.joints, self.target, strict=True)]
+            self.joints = [q + step for q, step in zip(self.joints, steps, strict=True)]
+            if max(map(abs, steps)) > STILL * PERIOD:
+                self.facts.moved = time.monotonic()
         values: dict[str, Any] = {
             **self.registers,
             "timestamp": time.monotonic(),

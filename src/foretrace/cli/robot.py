@@ -17,6 +17,8 @@ from foretrace.cli.console import say
 from foretrace.errors import RobotError
 from foretrace.files import write_json, write_text
 from foretrace.geometry import matrix_to_pose
+from foretrace.interactions.dataset import Dataset
+from foretrace.monitoring import Monitor
 from foretrace.planning import Plan
 from foretrace.robot.checks import ArmLimits, Check, check_path, refuse_unsafe
 from foretrace.robot.dashboard import check_host
@@ -25,6 +27,7 @@ from foretrace.robot.execution import WatchConfig
 from foretrace.robot.execution import execute as move
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import ArmPath, plan_lever_up, plan_retreat, read_base_pose
+from foretrace.robot.pose_watch import AlarmConfig, PoseWatch, replay
 from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_NAMES
 
@@ -33,6 +36,7 @@ def robot(
     base: Path,
     path: Annotated[OmitArgPrefixes[ToolPath], arg(name="path")],
     watch: Annotated[OmitArgPrefixes[WatchConfig], arg(name="watch")],
+    alarm: Annotated[OmitArgPrefixes[AlarmConfig], arg(name="alarm")],
     plan: Positional[Path | None] = None,
     contact: tuple[float, float] | None = None,
     direction: tuple[float, float] | None = None,
@@ -45,6 +49,9 @@ def robot(
     camera: str | None = None,
     correction: tuple[float, float, float] = (0.0, 0.0, 0.0),
     is_ur10: bool = False,
+    monitor: bool = False,
+    poses: tuple[Path, int] | None = None,
+    false_alarms: float = 0.05,
 ) -> None:
     """Plan and check a lever-up for a real UR10 (CB3); with --execute, move the arm (experimental).
 
@@ -71,6 +78,11 @@ def robot(
         correction: Deviation of the blade's tip by the arm's own calibration, X Y Z in the table frame [m], as the
             command gives it before the blade goes down.
         is_ur10: The arm is a UR10 (CB3); for a controller before PolyScope 3.12, which cannot say so.
+        monitor: Compare the object's poses with what the plan imagined while the arm levers it up, and act on an alarm.
+        poses: Folder of a data set and number of an interaction, whose poses are replayed as if they were tracked now:
+            a rehearsal. A tracker of one's own is connected in Python.
+        false_alarms: Share of whole normal executions that may alarm.
+        alarm: What an alarm does.
     """
     if execute and host is None:
         raise RobotError("--execute needs --host, the controller's address")
@@ -86,6 +98,9 @@ def robot(
     limits, kinematics = ArmLimits(), ArmKinematics(Screwdriver())
     T_table_base = read_base_pose(base)
     T_table_base[:3, 3] += correction
+    pose_watch = _pose_watch(plan, poses, alarm, false_alarms, speed) if monitor else None
+    if poses is not None and not monitor:
+        raise RobotError("--poses needs --monitor, which watches them")
     action = _action(plan, contact, direction, path)
     legs = plan_lever_up(kinematics, action, T_table_base, speed)
     legs += plan_retreat(legs) if retreat else []
@@ -115,6 +130,7 @@ def robot(
             *(host, legs, kinematics, T_table_base, recording, limits, watch, confirm, video),
             correction=correction,
             is_ur10=is_ur10,
+            pose_watch=pose_watch,
         )
     except KeyboardInterrupt as interrupt:
         stop = (
@@ -122,7 +138,29 @@ def robot(
         )
         say(f"interrupted; {stop}")
         raise
+    if pose_watch is not None and (verdict := pose_watch.verdict) is not None:
+        print(f"no alarm: score {verdict.score:.2f} of {verdict.threshold:.2f}; {verdict.message}")
     print(recording)
+
+
+def _pose_watch(
+    plan: Path | None, poses: tuple[Path, int] | None, alarm: AlarmConfig, false_alarms: float, speed: float
+) -> PoseWatch:
+    """The monitor of a plan, with replayed poses.
+
+    Raises:
+        RobotError: There is no plan, or no poses.
+        PlanningError: The plan cannot be read.
+        DatasetError: There is no such interaction.
+        MonitoringError: The plan imagines no rotations, or the share is out of range.
+    """
+    if plan is None:
+        raise RobotError("--monitor needs a plan.json of `foretrace plan`, which says what was imagined")
+    if poses is None:
+        raise RobotError("--monitor needs --poses DATA ID, a recording of the action to rehearse with")
+    folder, id = poses
+    source = replay(Dataset.open(folder).with_id(id).effect)
+    return PoseWatch(Monitor(Plan.open(plan), false_alarms), source, alarm, speed, say)
 
 
 def _action(

@@ -19,6 +19,7 @@ from foretrace.robot.controller import ArmState, UrController
 from foretrace.robot.deviation import Deviation, measure_deviation, refuse_other_arm, refuse_uncorrected
 from foretrace.robot.kinematics import ArmKinematics
 from foretrace.robot.path import LEVER_UP, ArmPath, plan_approach
+from foretrace.robot.pose_watch import PoseWatch
 from foretrace.robot.video import VideoRecorder
 from foretrace.simulation.arm import CONTROL_PERIOD, JOINT_LIMIT, JOINT_NAMES
 
@@ -105,6 +106,7 @@ def execute(
     video: VideoRecorder | None = None,
     correction: Sequence[float] = (0.0, 0.0, 0.0),
     is_ur10: bool = False,
+    pose_watch: PoseWatch | None = None,
 ) -> None:
     """Bring the arm to the start of the first leg, and move it along all of them.
 
@@ -123,6 +125,7 @@ def execute(
         video: Recorder that films the motion.
         correction: The part of ``T_table_base``'s position that corrects for the arm's own calibration [m].
         is_ur10: Whether the arm is known to be a UR10 (CB3), where its controller is too old to say.
+        pose_watch: Watches the object during the lever-up; its alarm ends the motion.
 
     Raises:
         RobotError: If the arm is not ready or no UR10, its way to the start is not safe, or the motion was stopped.
@@ -152,8 +155,14 @@ def execute(
             refuse_uncorrected(check_kinematics(state), np.array(correction), watch.height_error)
 
         checked = [_CheckedLeg(approach, check_kinematics), _CheckedLeg(legs[0], check_tip)]
-        with _noted_signals() as signals, MotionLog(out) as log, video or nullcontext():
-            stopped = _move(controller, [*checked, *map(_CheckedLeg, legs[1:])], log, watch, video, signals)
+        with (
+            _noted_signals() as signals,
+            pose_watch or nullcontext(),
+            MotionLog(out) as log,
+            video or nullcontext(),
+        ):
+            all_legs = [*checked, *map(_CheckedLeg, legs[1:])]
+            stopped = _move(controller, all_legs, log, watch, video, signals, pose_watch)
         if signals:
             raise KeyboardInterrupt(signals[0], stopped)
     finally:
@@ -214,6 +223,7 @@ def _move(
     watch: WatchConfig,
     video: VideoRecorder | None,
     signals: Sequence[int],
+    pose_watch: PoseWatch | None,
 ) -> str:
     """Give one set point each control period; none is ever left out, so a delay here only makes the arm wait.
 
@@ -226,31 +236,43 @@ def _move(
     recent: deque[np.ndarray] = deque(maxlen=round(LAG / CONTROL_PERIOD))
     recent.append(legs[0].path.joints[0])
     hold = ArmPath("hold", np.repeat(legs[-1].path.joints[-1:], round(SETTLE / CONTROL_PERIOD), axis=0))
-    reason = place = ""
+    ahead = deque([*legs, _CheckedLeg(hold)])
+    reason = alarm = place = ""
     try:
         controller.take_control()
-        for leg in [*legs, _CheckedLeg(hold)]:
+        while ahead and not reason:  # no leg follows a stop: the way back might be as unsafe as the way on
+            leg = ahead.popleft()
             path = leg.path
+            watched = pose_watch if path.name == LEVER_UP else None
             if video is not None and path.name == LEVER_UP:
                 video.action_start = time.monotonic()
             for sample, set_point in enumerate(path.joints):
                 place = f"{path.name}, sample {sample} of {len(path.joints)}"
                 state = controller.state()
                 reason = "interrupted" if signals else _reason_to_stop(controller, state, recent, watch)
+                if not reason and watched is not None and (alarm := watched.alarm()):
+                    if (answer := watched.answer(path, sample)) is not None:
+                        watched.tell(f"{alarm}: {answer.name}")
+                        ahead = deque([_CheckedLeg(answer)])
+                        break
+                    reason = alarm
                 if not reason and sample == 0:
                     leg.check(state)
                 log.add(path.name, state, recent[-1])
+                if watched is not None:
+                    watched.clock.tick()
                 if not reason and not controller.send(set_point):
                     reason = "connection lost"
                 if reason:
                     break
                 recent.append(set_point)
-            if reason:  # no leg follows a stop: the way back might be as unsafe as the way on
-                break
     finally:
         outcome = controller.stop()
-    if reason and not signals:
-        raise RobotError(f"motion given up: {reason}, {place}; {outcome}; the recording is kept")
+    if pose_watch is not None:  # the last verdict may come when the next leg has begun
+        alarm = alarm or pose_watch.verdict_line()
+    reasons = dict.fromkeys(each for each in (alarm, reason) if each)
+    if reasons and not signals:
+        raise RobotError(f"motion given up: {'; '.join(reasons)}, {place}; {outcome}; the recording is kept")
     return f"{place}; {outcome}"
 
 
