@@ -1,4 +1,7 @@
-"""Pushes of one plate, by the quasi-static model and by MuJoCo, in turns: python benchmarks/pushes.py"""
+"""Pushes of one plate, by the quasi-static model and by MuJoCo, in turns.
+
+Usage: python benchmarks/pushes.py
+"""
 
 import time
 
