@@ -210,7 +210,7 @@ def test_an_unknown_option_or_a_file_in_the_way_is_no_traceback(label: str, tmp_
     assert told.count("\n") == 1
     assert f"; `foretrace evaluate {label} --help` lists the options" in told
     # Where options are required, the missing ones come first.
-    assert ("Missing" if label in ("predictor", "reconstruction") else "--levitate") in told
+    assert ("Missing" if label in ("predictor", "reconstruction", "pushes") else "--levitate") in told
 
 
 # --- the mechanism --------------------------------------------------------------------------------------------
