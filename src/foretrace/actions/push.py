@@ -21,6 +21,8 @@ TIPPED = np.deg2rad(10.0)
 """An object that tilts by more than this has tipped [rad]."""
 LOST_GAP = 0.0015
 """A rod that ends farther than this from the object has lost it [m]."""
+DEEPEST = 0.002
+"""A rod that starts farther inside an object than this is refused [m]."""
 RAMP = 0.05
 """Time in which the rod gains or loses its speed [s]."""
 
@@ -141,6 +143,22 @@ class Push(Action):
             - self.tool.radius
         )
         return Judgement(PushOutcome.TURNED_AWAY if gap > LOST_GAP else PushOutcome.PUSHED)
+
+    def check_contact(self, obj: ObjectModel) -> None:
+        """Refuse a push that does not start on an object's outline, or whose rod starts inside the object.
+
+        Raises:
+            ActionError: Naming how far it is off.
+        """
+        super().check_contact(obj)
+        start = self.contact - (self.path.approach + self.tool.radius) * self.direction
+        outline = shapely.Polygon(obj.corners)
+        inside = self.tool.radius - float(shapely.distance(outline, shapely.Point(start)))
+        if inside > DEEPEST:
+            raise ActionError(
+                f"the rod starts {1000 * inside:.1f} mm inside the object: give a direction into it, or a "
+                f"longer approach than {self.path.approach:g} m"
+            )
 
     def parameters(self) -> dict[str, float]:
         """``distance`` [m], ``speed`` [m/s] and ``approach`` [m] of the path."""

@@ -94,7 +94,8 @@ class PushesExperiment(Experiment):
     skip_bad: bool = False
     """Leave out rows that are wrong, and list them."""
     methods: tuple[str, ...] = ()
-    """Methods that are compared; by default all."""
+    """Methods that are compared: stays, constant, nearest, simulation, mujoco, identified-20, identified, learned,
+    residual, and models whose predictions are in the table; by default all."""
 
     label = "pushes"
     summary = SUMMARIES["pushes"]
@@ -130,7 +131,7 @@ class PushesExperiment(Experiment):
             {
                 "line": test.line,
                 "surface": [f"on {name}" for name in test.surface],
-                "shape": [test.shapes[k].name for k in test.shape],
+                "shape": [_in_words(test.shapes[k].name) for k in test.shape],
                 "speed_mm_s": np.round(1000 * test.speed, 3),
                 "position_mm": np.round(1000 * errors[:, 0], 4),
                 "rotation_deg": np.round(np.rad2deg(errors[:, 1]), 4),
@@ -172,8 +173,6 @@ class PushesExperiment(Experiment):
 
     @cached_property
     def _read(self) -> tuple[RecordedPushes, list[str]]:
-        if not 0.0005 <= self.rod_radius <= 0.1:
-            raise ResultsError(f"rod_radius = {self.rod_radius} m: give 0.0005 to 0.1 m")
         return read_pushes(self.pushes, self.shapes, self.skip_bad, self.rod_radius)
 
     @cached_property
@@ -213,7 +212,8 @@ def split_pushes(pushes: RecordedPushes, train: int | None, held_out: str | None
         raise ResultsError(
             f"train = {shown(wanted)}: give {FEWEST} to {len(rest)}, as many pushes as are left for learning"
             if len(rest) >= FEWEST
-            else f"{len(rest)} pushes are left to learn from: give a table with {FEWEST} or more of them"
+            else f"{len(rest)} of {len(pushes)} pushes are left to learn from, {len(test)} are set aside: "
+            f"give a table with {2 * FEWEST} pushes or more"
         )
     return Task(pushes[np.sort(rest[:wanted])], pushes[np.sort(test)], held_out is not None, seed)
 
@@ -354,6 +354,11 @@ METHODS: dict[str, Callable[[Task], Answer]] = {
     "residual": _residual,
 }
 """Every method beside those whose predictions are in the table."""
+
+
+def _in_words(name: str) -> str:
+    """Name of a shape, which must not look like a number in a table."""
+    return name if name[:1].isalpha() and name.lower() not in ("nan", "inf", "infinity") else f"shape {name}"
 
 
 def repetitions(pushes: RecordedPushes) -> dict[str, float | int]:

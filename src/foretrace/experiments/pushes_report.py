@@ -34,6 +34,8 @@ SHOWN = "residual"
 """Method whose predictions are drawn."""
 RESAMPLED = 1000
 """Bootstrap samples of an interval of a mean."""
+MANY = 30
+"""Fewer pairs of repeated pushes tell nothing of the least error."""
 WORST, TYPICAL = 4, 8
 """Pushes that are drawn."""
 
@@ -114,7 +116,7 @@ def report_of(summary: Mapping[str, Any]) -> str:
         markdown_table(head, lines),
     ]
     repeated = summary["repetitions"]
-    if repeated["pairs"]:
+    if repeated["pairs"] >= MANY:
         text.append(
             f"\n{repeated['pairs']} pairs of pushes repeat each other: their objects end {repeated['position_mm']:.2f} "
             f"mm and {repeated['rotation_deg']:.2f}° apart. Divided by the square root of 2, that is about the least "
@@ -184,7 +186,8 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
         ax.plot([0, 1], [0, 1], ":", color=GREY)
         grid(ax, xlabel=f"level of the {name} region", xlim=(0, 1), ylim=(0, 1))
     axes[0].set_ylabel("share of pushes inside")
-    axes[1].legend(loc="lower right")
+    if axes[1].get_legend_handles_labels()[0]:
+        axes[1].legend(loc="lower right")
     finish(fig, "Regions hold what they promise", "dotted: as promised")
     return fig
 
@@ -204,7 +207,8 @@ def draw_poses(rows: pd.DataFrame, test: RecordedPushes) -> Figure:
         _draw_pose(ax, each, test, place[int(each["line"])])
     for ax in axes[len(chosen) :]:
         ax.set_axis_off()
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    if chosen:
+        fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     finish(fig, "Recorded and predicted poses after pushes", "errors from the least to the four worst")
     return fig
 

@@ -118,6 +118,11 @@ class Imaginer(ABC):
         return self.name
 
     @property
+    def learned_outcomes(self) -> tuple[str, ...]:
+        """Outcomes of the motions that it imagines; of none, it imagines any action."""
+        return ()
+
+    @property
     def needs_effect(self) -> str | None:
         """What it reads that only the effect reveals, so that it cannot imagine from a view; None: nothing."""
         return None
@@ -160,6 +165,7 @@ class Imaginer(ABC):
         parameters = {}
         if action is not None:
             check_type("action", action, Action, PredictionError)
+            self._check_action(action)
             parameters = parameters_of([action])
         belief = context if isinstance(context, Belief) else None
         values = given_context(self.context, self._without(belief, context), parameters, 1, self.marginal)
@@ -260,6 +266,7 @@ class Imaginer(ABC):
             raise PredictionError("there is no candidate to imagine: give at least one action")
         for k, action in enumerate(actions):
             check_type(f"candidate {k}", action, Action, PredictionError)
+            self._check_action(action, f"candidate {k}: ")
         candidates = Candidates(view, actions)
         names = [f"candidate {k}: " for k in range(len(actions))]
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
@@ -274,6 +281,15 @@ class Imaginer(ABC):
             return self._average(view, actions, belief, candidates.enter(middle))
         start = "estimated" if com is None else "observed"
         return self._answer(Scenes(candidates, candidates.enter(middle), values, start), parameters)
+
+    def _check_action(self, action: Action, who: str = "") -> None:
+        """Refuse another kind of action than the one whose motions are imagined."""
+        odd = [name for name in self.learned_outcomes if name not in action.outcomes]
+        if odd:
+            raise PredictionError(
+                f"{who}a {action.label} never ends {shown(odd[0])}, as {self.name} has it: "
+                "give the kind of action that it learned from, or another imaginer"
+            )
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
         return self._warned(self.imagine_scenes(scenes), scenes.context, parameters)

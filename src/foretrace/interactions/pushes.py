@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from msgspec import Meta
 
 from foretrace.actions import Push, PushPath, Rod
-from foretrace.errors import DatasetError, ShapeError, shown
+from foretrace.errors import DatasetError, ShapeError, is_number, shown
 from foretrace.files import read_json
 from foretrace.objects import NO_BEVEL, Prism
 from foretrace.schema import Positive, Vector2
@@ -24,6 +24,10 @@ NUMBERS = (*POSES, *RODS, "speed_mm_s")
 """Columns of numbers that every table of pushes has."""
 ROD_RADIUS = 0.00475
 """Radius of the rod of M. Bauza, K.-T. Yu and A. Rodriguez's recordings [m]."""
+SMALLEST_ROD, LARGEST_ROD = 0.0005, 0.1
+"""Bounds of a rod's radius [m]."""
+SLOWEST, FASTEST = 0.5, 1000.0
+"""Bounds of the rod's speed [mm/s]."""
 FARTHEST = 10.0
 """Larger coordinates are no metres [m]."""
 LARGEST_ANGLE = 4 * np.pi
@@ -215,6 +219,8 @@ def read_pushes(
         DatasetError: A file is missing or no such file, or rows are wrong and are not to be left out.
         ShapeError: An outline is not usable.
     """
+    if not is_number(radius) or not SMALLEST_ROD <= radius <= LARGEST_ROD:
+        raise DatasetError(f"rod_radius = {shown(radius)} m: give {SMALLEST_ROD:g} to {LARGEST_ROD:g} m")
     known = read_shapes(shapes)
     columns, lines = _read_table(table)
     faults: dict[int, str] = {}
@@ -263,8 +269,13 @@ def _read_table(path: Path) -> tuple[dict[str, list[str]], list[int]]:
             rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except FileNotFoundError:
         raise DatasetError(f"{path} does not exist: give a CSV file of pushes") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as reason:
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path} cannot be read as UTF-8: save it as CSV in UTF-8") from None
+    except (OSError, csv.Error) as reason:
         raise DatasetError(f"{path} cannot be read ({shown(reason)}): give a CSV file of pushes") from None
+    twice = [name for name in dict.fromkeys(head) if head.count(name) > 1]
+    if twice:
+        raise DatasetError(f"{path.name} has the column {shown(twice[0])} twice: name each column once")
     missing = [name for name in ("shape", *NUMBERS) if name not in head]
     if missing:
         raise DatasetError(
@@ -313,8 +324,8 @@ def _find_faults(pushes: RecordedPushes, faults: dict[int, str]) -> None:
             faults[row] = f"a coordinate of {far:g} m: give metres (these look like millimetres)"
         elif angle > LARGEST_ANGLE:
             faults[row] = f"an angle of {angle:g} rad: give radians (these look like degrees)"
-        elif pushes.speed[row] <= 0:
-            faults[row] = f"speed_mm_s is {1000 * pushes.speed[row]:g}: give a speed above 0 in mm/s"
+        elif not SLOWEST <= 1000 * pushes.speed[row] <= FASTEST:
+            faults[row] = f"speed_mm_s is {1000 * pushes.speed[row]:g}: give {SLOWEST:g} to {FASTEST:g} mm/s"
         elif length[row] < SHORTEST:
             faults[row] = f"the rod moves by {1000 * length[row]:.2g} mm: it pushes nothing"
         elif first != row:

@@ -107,6 +107,10 @@ def write_pushes(
                 shards[name] = storage.write_shard(folder, name, storage.to_table(rows))
                 progress(len(rows))
                 rows = []
+        if id == 0:
+            raise DatasetError(
+                "none of the pushes can be kept: the rod passes each object, or leaves the view"
+            )
         manifest = storage.new_manifest(CONFIGURATION, id, SHARD_SIZE, versions_of("foretrace", "numpy"))
         storage.write_manifest(folder, manifest | {"shards": shards})
     return id, missed

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from foretrace.errors import ShapeError, check_type, shown
 from foretrace.objects.model import (
@@ -61,6 +60,10 @@ class Footed(ObjectModel):
         check_type("object", object, ObjectModel, ShapeError)
         if isinstance(object, Footed):
             raise ShapeError(f"object of type Footed: give {type(object.object).__name__} and one footing")
+        if not all(isinstance(shape, HullShape) for shape in object.collision_shapes()):
+            raise ShapeError(
+                f"a lying {object.kind} has no face to put feet under: give a prism, a box or a mesh"
+            )
         if footing not in FOOTINGS:
             raise ShapeError(f"footing {shown(footing)}: choose one of {', '.join(FOOTINGS)}")
         vars(self).update(
@@ -87,11 +90,7 @@ class Footed(ObjectModel):
 
     def collision_shapes(self) -> list[CollisionShape]:
         """The object's parts, cut off at the feet's height, and a pyramid on its tip for each foot."""
-        hulls = []
-        for shape in self.object.collision_shapes():
-            if not isinstance(shape, HullShape):
-                raise ShapeError("a round object stands on no feet: give a prism, a box or a mesh")
-            hulls.append(np.array(shape.vertices))
+        hulls = [np.array(s.vertices) for s in self.object.collision_shapes() if isinstance(s, HullShape)]
         together = convex_union(hulls)
         if together is not None:  # without seams between the parts, and faster
             hulls = [together]
@@ -124,6 +123,8 @@ class Footed(ObjectModel):
 
 def convex_union(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "_ 3"] | None:
     """The corners of the pieces' union if that is convex; None otherwise."""
+    from scipy.spatial import ConvexHull
+
     points = np.unique(np.concatenate(pieces), axis=0)
     whole = ConvexHull(points)
     volume = sum(ConvexHull(piece).volume for piece in pieces)

@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 
 from foretrace.errors import DatasetError
 from foretrace.interactions.dataset import Dataset
-from foretrace.interactions.record import Interaction, Outcome
+from foretrace.interactions.record import Interaction
 from foretrace.pictures.scene import draw_arrow, support_handle
 from foretrace.pictures.style import (
     CM,
@@ -15,10 +15,10 @@ from foretrace.pictures.style import (
     INK,
     OBJECT_COLOR,
     OBJECT_EDGE,
-    OUTCOME_COLORS,
     SUPPORT_COLOR,
     headline,
     new_figure,
+    outcome_color,
     styled,
 )
 
@@ -47,7 +47,7 @@ def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
     title = f"{len(dataset)} interactions, {len(shown)} shown; the bar is 10 cm"
     headline(fig, title)
     handles = [
-        Line2D([], [], color=OUTCOME_COLORS[Outcome(name)], linewidth=2.5, label=f"{name}: {count}")
+        Line2D([], [], color=outcome_color(name), linewidth=2.5, label=f"{name}: {count}")
         for name, count in counts.items()
     ]
     handles.append(support_handle())
@@ -58,7 +58,7 @@ def contact_sheet(dataset: Dataset, columns: int = 8, rows: int = 5) -> Figure:
 def _draw_cell(ax: Axes, interaction: Interaction) -> None:
     """A stamp-sized view from above, the same scale for all."""
     effect = interaction.effect
-    color = OUTCOME_COLORS[effect.outcome]
+    color = outcome_color(effect.outcome)
     placement = interaction.action.T_action_object
     outline = (interaction.object.corners @ placement[:2, :2].T + placement[:2, 3]) * CM
     ax.fill(outline[:, 1], outline[:, 0], facecolor=OBJECT_COLOR, edgecolor=OBJECT_EDGE, linewidth=0.9)

@@ -3,6 +3,7 @@
 The colours are Okabe and Ito's, which colour-blind readers can tell apart; line styles differ too.
 """
 
+import zlib
 from typing import Any
 
 import matplotlib as mpl
@@ -27,6 +28,14 @@ OUTCOME_COLORS: dict[str, str] = {
     Outcome.MISSED: "#8b93a1",
     Outcome.FAILED: "#22262e",
 }
+OTHER_COLORS = ("#009e73", "#e69f00", "#d55e00", "#cc79a7", "#0072b2")
+
+
+def outcome_color(outcome: str) -> str:
+    """Colour of an outcome of any action; those of the lever-up have their own."""
+    return OUTCOME_COLORS.get(outcome) or OTHER_COLORS[zlib.crc32(outcome.encode()) % len(OTHER_COLORS)]
+
+
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 9.5,

@@ -248,6 +248,11 @@ class EffectPredictor(Imaginer, nn.Module):
         """Name in messages."""
         return self.label
 
+    @property
+    def learned_outcomes(self) -> tuple[str, ...]:
+        """Outcomes of its training part."""
+        return self.learned_from
+
     @final
     @property
     def needs_effect(self) -> str | None:

@@ -91,6 +91,11 @@ class OnnxPredictor(Imaginer):
         return ONE_SHOT
 
     @property
+    def learned_outcomes(self) -> tuple[str, ...]:
+        """Outcomes that it distinguishes."""
+        return tuple(dict.fromkeys(self._outcome))
+
+    @property
     def sample_times(self) -> Float[np.ndarray, " time"]:
         """Times of the imagined samples [s]."""
         return self._times

@@ -150,6 +150,11 @@ class TwinImaginer(Imaginer):
         return "twin"
 
     @property
+    def learned_outcomes(self) -> tuple[str, ...]:
+        """Those of a lever-up, the action that it plays."""
+        return LeverUp.outcomes
+
+    @property
     def outcomes(self) -> tuple[str, ...]:
         """Outcome of each future."""
         return SLOTS
