@@ -66,7 +66,8 @@ class CollectConfig:
     recipe: str = "paper"
     """Kind of objects. paper: prisms. solids: lying cylinders, boxes and flat prisms, always three with one outline.
     mixed: prisms and solids. everyday: the same with prisms of many sizes, and flat objects with round, organic and
-    dented outlines. all: everyday and the paper's prisms. Other packages may add objects and actions of their own."""
+    dented outlines. all: everyday and the paper's prisms. pushes: plates that a rod pushes (--embodiment tool). Other
+    packages may add objects and actions of their own."""
     randomisation: Randomisation = NOTHING
     """What is drawn anew for every lever-up."""
     path: ToolPath = field(default_factory=ToolPath)
