@@ -166,7 +166,7 @@ def test_actions_of_ones_own_must_name_their_outcomes():
     with pytest.raises(TypeError, match="name some, each once, none 'failed'"):
         type("Kick", (Action,), {"label": "kick", "outcomes": ("kicked", "failed")})
     with pytest.raises(TypeError, match="'push' is taken by"):
-        type("Other", (Action,), {"label": "push", "outcomes": ("pushed",)})
+        type("Other", (Action,), {"label": "push", "outcomes": ("nudged",)})
     assert "kick" not in ACTIONS
 
 
@@ -238,9 +238,9 @@ def test_a_data_set_of_another_action(tmp_path):
     dataset = Dataset.open(tmp_path)
     assert counts == dataset.outcomes() == {"nudged": 3}
     assert examine(tmp_path).findings == ()
-    assert len(dataset.where(outcome="pushed", distance=0.06)) == 3
+    assert len(dataset.where(outcome="nudged", distance=0.06)) == 3
     with pytest.raises(
-        DatasetError, match=r"no outcome 'levered': choose from pushed, toppled, missed, failed"
+        DatasetError, match=r"no outcome 'levered': choose from nudged, toppled, missed, failed"
     ):
         dataset.where(outcome="levered")
     with pytest.raises(DatasetError, match="no column 'insertion'"):

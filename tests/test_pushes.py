@@ -354,3 +354,24 @@ def test_names_that_look_like_numbers_and_strange_tables(tmp_path):
         read_pushes(doubled, shapes)
     with pytest.raises(DatasetError, match=r"rod_radius = 4\.75 m: give 0\.0005 to 0\.1 m"):
         read_pushes(table, shapes, radius=4.75)
+
+
+def test_options_of_a_lever_ups_path_are_refused_for_pushes(tmp_path, capsys):
+    command = [
+        "simulate",
+        "--recipe",
+        "pushes",
+        "--embodiment",
+        "tool",
+        "--objects",
+        "1",
+        "--contacts-per-edge",
+        "1",
+    ]
+    refused = {
+        "insertion = 0.03 is of a lever-up's path, and recipe 'pushes' has a push": ["--insertion", "0.03"],
+        "the path of a push cannot be varied, only a lever-up's: leave --vary-action out": ["--vary-action"],
+    }
+    for number, (told, options) in enumerate(refused.items()):
+        assert main([*command, "--workers", "1", "--out", str(tmp_path / str(number)), *options]) == 2
+        assert told in capsys.readouterr().err

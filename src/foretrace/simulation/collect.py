@@ -109,6 +109,12 @@ def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, Action, int]:
     action = actions[contact_index]
     if isinstance(action, LeverUp):
         action = replace(action, path=config.path, tool=config.tool)
+    elif config.path != ToolPath():
+        given = next(name for name, value in vars(config.path).items() if value != getattr(ToolPath(), name))
+        raise SimulationError(
+            f"{given} = {getattr(config.path, given)!r} is of a lever-up's path, and recipe {config.recipe!r} has a "
+            f"{action.label}: leave it out"
+        )
     return obj, action, int(seed)
 
 
@@ -125,7 +131,9 @@ def simulate_trial(config: CollectConfig, id: int) -> Interaction:
     if isinstance(action, LeverUp):
         action = replace(action, path=path)
     elif path != config.path:
-        raise SimulationError(f"the path of a {action.label} cannot be varied: only that of a lever-up can")
+        raise SimulationError(
+            f"the path of a {action.label} cannot be varied, only a lever-up's: leave --vary-action out"
+        )
     return lever_up.simulate_lever_up(obj, action, simulation, seed=seed, id=id, execution_error=error)
 
 
