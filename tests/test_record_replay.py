@@ -51,12 +51,17 @@ def replay_all(config: CollectConfig, folder: Path, every: int = 1) -> None:
         assert_same_bytes(dataset[row])
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("recipe", [name for name in RECIPES if name != "pushes"])
 def test_rows_of_every_recipe_with_everything_drawn(tmp_path, recipe):
     objects = len(RECIPES[recipe].families)
     simulation = replace(TOOL, watch_time=0.4)
     config = CollectConfig(objects, 1, 3, simulation, recipe, EVERYTHING, PATH, SLIM)
     replay_all(config, tmp_path, every=3)
+
+
+def test_rows_of_pushes_with_everything_drawn_but_the_path(tmp_path):
+    drawn = replace(EVERYTHING, **dict.fromkeys(VARIED_ACTION))
+    replay_all(CollectConfig(7, 1, 3, TOOL, "pushes", drawn), tmp_path, every=9)
 
 
 @pytest.mark.parametrize(

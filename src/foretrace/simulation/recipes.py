@@ -159,12 +159,12 @@ class Pushed(Recipe):
         return plate, sample_pushes(plate, rng, self.count(object_index, per_edge))
 
 
-RECIPES.add("pushes", Pushed(Families(("prism",) * 3 + tuple(ROUND))))
 RECIPES.add("paper", Families(("prism",)))
 RECIPES.add("solids", Families(("alike",) * LOOK_ALIKES))
 RECIPES.add("mixed", Families(("prism",) * 2 + ("alike",) * LOOK_ALIKES))
 RECIPES.add("everyday", Families(("sized",) * 3 + ("alike",) * LOOK_ALIKES + tuple(ROUND)))
 RECIPES.add("all", Families(("prism",) * 3 + ("sized",) * 3 + ("alike",) * LOOK_ALIKES + tuple(ROUND)))
+RECIPES.add("pushes", Pushed(Families(("prism",) * 3 + tuple(ROUND))))
 
 
 def first_actions(recipe: str, objects: int, per_edge: int) -> list[int]:
