@@ -11,9 +11,9 @@ import numpy as np
 from rich.console import Console
 
 from foretrace.actions import LeverUp, ToolPath, sample_pushes
-from foretrace.geometry import continuous_quaternions, matrix_to_pose
+from foretrace.geometry import continuous_quaternions, matrix_to_pose, rotate_plane
 from foretrace.interactions.dataset import InteractionBatch
-from foretrace.interactions.pushes import PushedShape, RecordedPushes, turned
+from foretrace.interactions.pushes import PushedShape, RecordedPushes
 from foretrace.interactions.record import Effect, Interaction, Outcome, Physics, Provenance
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import NO_BEVEL, ObjectModel, Prism, sample_prism
@@ -192,7 +192,7 @@ def write_push_table(
         push = sample_pushes(plates[which[row]].model, rng, 1)[0]
         start = push.contact - (push.path.approach + push.tool.radius) * push.direction
         ends = np.stack([start, start + 0.03 * push.direction])
-        rod[row] = before[row, :2] + turned(ends, np.full(2, before[row, 2]))
+        rod[row] = before[row, :2] + rotate_plane(ends, np.full(2, before[row, 2]))
     tips = np.round(rod, 6)
     before = np.round(before, 6)
     speed, lines = np.full(count, 0.02), np.arange(count) + 2
@@ -201,7 +201,7 @@ def write_push_table(
     moved = twin.predict(pushes)
     moved[:, :2] += farther * pushes.motion / np.linalg.norm(pushes.motion, axis=1)[:, None]
     moved += noise * rng.standard_normal((count, 3)) * [1, 1, 20]
-    after = before + np.column_stack([turned(moved[:, :2], before[:, 2]), moved[:, 2]])
+    after = before + np.column_stack([rotate_plane(moved[:, :2], before[:, 2]), moved[:, 2]])
     head = ["surface", "shape", "speed_mm_s", "x0", "y0", "theta0", "x1", "y1", "theta1"]
     head += ["tip_x0", "tip_y0", "tip_x1", "tip_y1"]
     lines = [",".join(head)]

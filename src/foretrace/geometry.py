@@ -302,6 +302,19 @@ def rotation_angle(
     )
 
 
+def wrap_angle(angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """The same angles between -pi and pi [rad]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def rotate_plane(
+    vectors: Float[np.ndarray, "n 2"], angle: Float[np.ndarray, " n"] | float
+) -> Float[np.ndarray, "n 2"]:
+    """Vectors in the plane, each rotated to the left [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=1)
+
+
 def tilt(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
     """Angle between the body's z axis and the world's [rad]."""
     return np.asarray(np.arctan2(np.hypot(rotation[..., 0, 2], rotation[..., 1, 2]), rotation[..., 2, 2]))

@@ -20,8 +20,8 @@ from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.pushes_report import draw_coverage, draw_errors, draw_poses, report_of, summary_of
 from foretrace.files import short_hash
-from foretrace.geometry import quaternion_to_matrix
-from foretrace.interactions.pushes import ROD_RADIUS, RecordedPushes, read_pushes, turned
+from foretrace.geometry import quaternion_to_matrix, rotate_plane
+from foretrace.interactions.pushes import ROD_RADIUS, RecordedPushes, read_pushes
 from foretrace.interactions.record import Physics
 from foretrace.objects import Footed
 from foretrace.simulation.engine import make_engine
@@ -243,11 +243,11 @@ def _constant(task: Task) -> Answer:
     """The mean displacement along the push and to its left, and the mean turn."""
     ahead = [np.arctan2(each.motion[:, 1], each.motion[:, 0]) for each in (task.learn, task.test)]
     displacement = task.learn.displacement()
-    mean = turned(displacement[:, :2], -ahead[0]).mean(axis=0)
+    mean = rotate_plane(displacement[:, :2], -ahead[0]).mean(axis=0)
     turn = displacement[:, 2].mean()
 
     def spread(angle: np.ndarray) -> np.ndarray:
-        moved = turned(np.broadcast_to(mean, (len(angle), 2)), angle)
+        moved = rotate_plane(np.broadcast_to(mean, (len(angle), 2)), angle)
         return np.column_stack([moved, np.full(len(angle), turn)])
 
     return _calibrated(task, spread(ahead[1]), spread(ahead[0]))
@@ -273,7 +273,7 @@ def _place(pushes: RecordedPushes, new_shape: bool) -> np.ndarray:
     centre = np.array([shape.centroid for shape in pushes.shapes])[pushes.shape]
     start = 100 * (pushes.start - centre)
     if new_shape:
-        return turned(start, -angle)
+        return rotate_plane(start, -angle)
     numbers = {name: k for k, name in enumerate(sorted(shape.name for shape in pushes.shapes))}
     which = np.array([numbers[shape.name] for shape in pushes.shapes])[pushes.shape]
     return np.column_stack([start, 3 * np.cos(angle), 3 * np.sin(angle), 1000 * which])
@@ -281,12 +281,12 @@ def _place(pushes: RecordedPushes, new_shape: bool) -> np.ndarray:
 
 def _by_rod(pushes: RecordedPushes, displacement: np.ndarray) -> np.ndarray:
     angle = np.arctan2(pushes.motion[:, 1], pushes.motion[:, 0])
-    return np.column_stack([turned(displacement[:, :2], -angle), displacement[:, 2]])
+    return np.column_stack([rotate_plane(displacement[:, :2], -angle), displacement[:, 2]])
 
 
 def _by_object(pushes: RecordedPushes, displacement: np.ndarray) -> np.ndarray:
     angle = np.arctan2(pushes.motion[:, 1], pushes.motion[:, 0])
-    return np.column_stack([turned(displacement[:, :2], angle), displacement[:, 2]])
+    return np.column_stack([rotate_plane(displacement[:, :2], angle), displacement[:, 2]])
 
 
 def _simulation(task: Task) -> Answer:

@@ -11,7 +11,8 @@ from matplotlib.patches import Circle, Polygon
 
 from foretrace.evaluation.charts import finish, grid
 from foretrace.evaluation.tables import markdown_table, number
-from foretrace.interactions.pushes import RecordedPushes, turned
+from foretrace.geometry import rotate_plane
+from foretrace.interactions.pushes import RecordedPushes
 from foretrace.pictures.style import GREY, INK, PREDICTION_COLORS, TOOL_COLOR, TRUTH_COLOR, new_figure, styled
 
 WORDS = {
@@ -221,7 +222,7 @@ def _draw_pose(ax: Axes, each: Mapping[str, Any], test: RecordedPushes, row: int
     ahead = np.arctan2(motion[1], motion[0])
 
     def outline(pose: Sequence[float] | np.ndarray) -> np.ndarray:
-        return 100 * _turn(_turn(corners, pose[2]) + pose[:2] - centre, np.pi / 2 - ahead)
+        return 100 * rotate_plane(rotate_plane(corners, pose[2]) + pose[:2] - centre, np.pi / 2 - ahead)
 
     ax.add_patch(Polygon(outline([0.0, 0.0, 0.0]), fill=False, edgecolor=GREY, linestyle=":", label="before"))
     ax.add_patch(Polygon(outline(truth), facecolor=TRUTH_COLOR, alpha=0.25))
@@ -229,7 +230,9 @@ def _draw_pose(ax: Axes, each: Mapping[str, Any], test: RecordedPushes, row: int
     ax.add_patch(
         Polygon(outline(found), fill=False, edgecolor=PREDICTION_COLORS[0], linestyle="--", label="predicted")
     )
-    middle = 100 * _turn(_turn(centre[None], found[2]) + found[:2] - centre, np.pi / 2 - ahead)[0]
+    middle = (
+        100 * rotate_plane(rotate_plane(centre[None], found[2]) + found[:2] - centre, np.pi / 2 - ahead)[0]
+    )
     if np.isfinite(each["radius_90_mm"]):
         ax.add_patch(
             Circle(
@@ -240,7 +243,7 @@ def _draw_pose(ax: Axes, each: Mapping[str, Any], test: RecordedPushes, row: int
                 label="90 % region",
             )
         )
-    ways = 100 * _turn(np.stack([start, start + motion]) - centre, np.pi / 2 - ahead)
+    ways = 100 * rotate_plane(np.stack([start, start + motion]) - centre, np.pi / 2 - ahead)
     ax.plot(*ways.T, color=TOOL_COLOR, linewidth=2.5, solid_capstyle="round", label="rod")
     ax.add_patch(Circle(ways[1], 100 * test.radius, facecolor=TOOL_COLOR))
     ax.set_aspect("equal")
@@ -253,7 +256,3 @@ def _draw_pose(ax: Axes, each: Mapping[str, Any], test: RecordedPushes, row: int
     ax.set_title(
         f"{each['shape']}: {each['position_mm']:.1f} mm, {each['rotation_deg']:.1f}°", fontsize=8.5, color=INK
     )
-
-
-def _turn(points: np.ndarray, angle: float) -> np.ndarray:
-    return turned(np.atleast_2d(points), np.full(len(np.atleast_2d(points)), angle))

@@ -15,6 +15,7 @@ from msgspec import Meta
 from foretrace.actions import Push, PushPath, Rod
 from foretrace.errors import DatasetError, ShapeError, is_number, shown
 from foretrace.files import read_json
+from foretrace.geometry import rotate_plane, wrap_angle
 from foretrace.objects import NO_BEVEL, Prism
 from foretrace.schema import Positive, Vector2
 
@@ -123,12 +124,12 @@ class RecordedPushes:
     @property
     def start(self) -> Float[np.ndarray, "pushes 2"]:
         """Centre of the rod before each push, in the object frame at rest [m]."""
-        return turned(self.rod[:, 0] - self.before[:, :2], -self.before[:, 2])
+        return rotate_plane(self.rod[:, 0] - self.before[:, :2], -self.before[:, 2])
 
     @property
     def motion(self) -> Float[np.ndarray, "pushes 2"]:
         """Displacement of the rod, in the object frame at rest [m]."""
-        return turned(self.rod[:, 1] - self.rod[:, 0], -self.before[:, 2])
+        return rotate_plane(self.rod[:, 1] - self.rod[:, 0], -self.before[:, 2])
 
     def displacement(
         self, after: Float[np.ndarray, "pushes 3"] | None = None
@@ -139,8 +140,8 @@ class RecordedPushes:
             after: Poses after the pushes; by default the recorded ones.
         """
         after = self.after if after is None else after
-        moved = turned(after[:, :2] - self.before[:, :2], -self.before[:, 2])
-        return np.column_stack([moved, wrapped(after[:, 2] - self.before[:, 2])])
+        moved = rotate_plane(after[:, :2] - self.before[:, :2], -self.before[:, 2])
+        return np.column_stack([moved, wrap_angle(after[:, 2] - self.before[:, 2])])
 
     def action(self, row: int) -> Push | None:
         """The push of a row, placed on its object; None where the rod passes the object without touching it."""
@@ -166,19 +167,6 @@ class RecordedPushes:
         approach = ahead - self.radius
         path = PushPath(distance=length - approach, approach=approach, speed=float(self.speed[row]))
         return Push(start + ahead * direction, direction, path, Rod(radius=self.radius))
-
-
-def turned(
-    vectors: Float[np.ndarray, "pushes 2"], angle: Float[np.ndarray, " pushes"]
-) -> Float[np.ndarray, "pushes 2"]:
-    """Vectors turned to the left [rad]."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=1)
-
-
-def wrapped(angle: Float[np.ndarray, " pushes"]) -> Float[np.ndarray, " pushes"]:
-    """Angles between -pi and pi [rad]."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def read_shapes(path: Path) -> dict[str, PushedShape]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import Action
 from foretrace.errors import PlanningError
-from foretrace.geometry import convex_hull
+from foretrace.geometry import convex_hull, wrap_angle
 from foretrace.imagined import Futures, ImaginedBatch
 
 SAME_TIME = 1e-9
@@ -148,7 +148,7 @@ class Motions:
         z = self.at_end(self.turned)[..., 2]
         share = np.divide(z, angle, out=np.zeros_like(z), where=angle > 0)
         turn = 2 * np.arctan2(np.sin(angle / 2) * share, np.cos(angle / 2))
-        return (turn + np.pi) % (2 * np.pi) - np.pi
+        return wrap_angle(turn)
 
     def footprints(
         self, rows: Int[np.ndarray, " n"], futures: Int[np.ndarray, " n"], samples: Int[np.ndarray, " time"]

@@ -1,18 +1,22 @@
 """Quasi-static pushes of a flat object, many at once.
 
-Friction alone decides how it slides, as it does at a few centimetres a second (M. T. Mason, Mechanics and Planning of
-Manipulator Pushing Operations, 1986).
+Friction alone determines how it slides, as it does at a few centimetres a second (M. T. Mason, Mechanics and Planning
+of Manipulator Pushing Operations, 1986).
+
 The object touches the table at feet that each carry a share of its weight. While it slides, the friction at each foot
 is opposite to that foot's velocity; of all motions that the rod allows, the one that dissipates least takes place
-(S. Goyal, A. Ruina, J. Papadopoulos, Planar sliding with dry friction, 1991). How heavy the object is, how fast the
-rod moves and how large the friction coefficient of the table is do not matter.
+(S. Goyal, A. Ruina, J. Papadopoulos, Planar sliding with dry friction, 1991). The mass of the object, the speed of the
+rod and the friction coefficient of the table have no influence.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from jaxtyping import Bool, Float, Int
+
+from foretrace.geometry import rotate_plane
 
 SMOOTHING = 1e-3
 """Feet slower than this share of the rod's speed are smoothed over."""
@@ -85,21 +89,16 @@ def slide(
         np.zeros(count), np.zeros((count, 2)), np.zeros(count, dtype=int), np.ones(count, dtype=bool)
     )
     for step in range(1, steps + 1):
-        rod = _turned(start + motion * (step / steps) - position, -angle)
+        rod = rotate_plane(start + motion * (step / steps) - position, -angle)
         contact = _touch(footprint.outline, rod, radius)
         rows = np.flatnonzero(contact.depth > 0)
         if len(rows):
             touching = _Contact(*(values[rows] for values in contact))
-            advance = _turned(motion[rows] / steps, -angle[rows])
+            advance = rotate_plane(motion[rows] / steps, -angle[rows])
             shift, turn = _follow(footprint.feet, touching, advance, friction, iterations, rows, memory)
-            position[rows] += _turned(shift, angle[rows] + turn / 2)
+            position[rows] += rotate_plane(shift, angle[rows] + turn / 2)
             angle[rows] += turn
     return position, angle
-
-
-def _turned(vectors: Plane, angle: Float[np.ndarray, " pushes"]) -> Plane:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=1)
 
 
 def _touch(outline: Float[np.ndarray, "n 2"], rod: Plane, radius: float) -> _Contact:
@@ -112,20 +111,11 @@ def _touch(outline: Float[np.ndarray, "n 2"], rod: Plane, radius: float) -> _Con
     rows, edge = np.arange(len(rod)), (towards**2).sum(axis=-1).argmin(axis=1)
     towards = towards[rows, edge]
     distance = np.linalg.norm(towards, axis=1)
-    inside = _is_inside(outline, rod)
+    inside = shapely.contains_xy(shapely.Polygon(outline), *rod.T)
     inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths[:, None]
     straight = np.where(inside, -1.0, 1.0)[:, None] * towards / np.maximum(distance, 1e-12)[:, None]
     normal = np.where((distance < 1e-7)[:, None], inward[edge], straight)
     return _Contact(rod + towards, normal, radius - np.where(inside, -distance, distance))
-
-
-def _is_inside(outline: Float[np.ndarray, "n 2"], points: Plane) -> Bool[np.ndarray, " pushes"]:
-    """Whether points lie inside a polygon: a ray from each crosses it an odd number of times."""
-    a, b = outline, np.roll(outline, -1, axis=0)
-    x, y = points[:, :1], points[:, 1:]
-    crosses = (a[:, 1] > y) != (b[:, 1] > y)
-    rise = np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
-    return (crosses & (x < a[:, 0] + (y - a[:, 1]) / rise * (b[:, 0] - a[:, 0]))).sum(axis=1) % 2 == 1
 
 
 def _follow(

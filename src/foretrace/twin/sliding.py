@@ -1,19 +1,18 @@
-"""A twin of planar pushes: the quasi-static model, with constants that recorded pushes tell.
+"""A twin of planar pushes: the quasi-static model, with constants that are identified from recorded pushes.
 
-What cannot be known beforehand of a real object on a real table is how its weight is spread over its face, the rod's
-friction, and by how much the frames of object, rod and table are apart. Few pushes tell what all shapes share, more of
-them what is each shape's own: every value has a prior, and what the pushes do not tell keeps it.
+The constants are the rod's friction, how an object's weight is spread over its lower face, and offsets between the
+frames of object, rod and table. Every constant has a prior: few pushes suffice for those that all shapes share, each
+shape's own need more.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import PredictionError
-from foretrace.interactions.pushes import PushedShape, RecordedPushes, turned
+from foretrace.geometry import rotate_plane
+from foretrace.interactions.pushes import PushedShape, RecordedPushes
 from foretrace.objects.footed import feet_of
 from foretrace.simulation.sliding import Footprint, slide
 
@@ -79,15 +78,12 @@ class SlidingTwin:
         return found
 
     @classmethod
-    def identified(
-        cls, pushes: RecordedPushes, seed: int = 0, progress: Callable[[], Any] = lambda: None
-    ) -> "SlidingTwin":
+    def identified(cls, pushes: RecordedPushes, seed: int = 0) -> "SlidingTwin":
         """The twin whose constants explain recorded pushes best.
 
         Args:
             pushes: Pushes to learn from.
             seed: Decides which pushes are used where there are more than `MOST_FITTED` of a shape.
-            progress: Called after each fit.
 
         Raises:
             PredictionError: There are no pushes.
@@ -97,14 +93,10 @@ class SlidingTwin:
         rng = np.random.default_rng(seed)
         some = rng.permutation(len(pushes))[: 2 * MOST_FITTED]
         shared = _fit(pushes[np.sort(some)], np.zeros(len(NAMES)), SHARED)
-        # The spread along x stands for both directions where shapes share it.
-        shared[2] = shared[1]
-        progress()
         own = {}
         for group, rows in groups_of(pushes).items():
             kept = np.sort(rng.permutation(rows)[:MOST_FITTED])
             own[group] = _fit(pushes[kept], shared, OWN)
-            progress()
         return cls(np.where(np.isin(np.arange(len(NAMES)), SPREADS), 0.0, shared), own)
 
 
@@ -121,8 +113,8 @@ def _play(pushes: RecordedPushes, values: Float[np.ndarray, " names"], change: C
     """Displacements and turns of pushes of one shape."""
     shape = pushes.shapes[pushes.shape[0]]
     footprint = _footprint(shape, values, change.spread)
-    rod = turned(np.broadcast_to(1e-3 * values[7:9], (len(pushes), 2)), -pushes.before[:, 2])
-    motion = turned(pushes.motion, np.full(len(pushes), change.turn))
+    rod = rotate_plane(np.broadcast_to(1e-3 * values[7:9], (len(pushes), 2)), -pushes.before[:, 2])
+    motion = rotate_plane(pushes.motion, np.full(len(pushes), change.turn))
     left = np.stack([-motion[:, 1], motion[:, 0]], axis=1) / np.linalg.norm(motion, axis=1)[:, None]
     friction = FRICTION * np.exp(values[0]) * change.friction
     start = pushes.start + rod + change.left * left
@@ -143,25 +135,26 @@ def _fit(
 ) -> Float[np.ndarray, " names"]:
     """Most probable values under normal priors and errors with long tails, by Gauss and Newton's method.
 
-    A standard deviation of 0 in one of the two spreads ties them to each other.
+    A standard deviation of 0 of the spread along y ties it to that along x.
     """
     free = np.flatnonzero(std > 0)
-    tied = std[2] == 0 < std[1]
+    tied = std[SPREADS[1]] == 0
+
+    def whole(values: np.ndarray) -> np.ndarray:
+        values = values.copy()
+        if tied:
+            values[SPREADS[1]] = values[SPREADS[0]]
+        return values
 
     def residuals(values: np.ndarray) -> np.ndarray:
-        values = values.copy()
-        values[2] = values[1] if tied else values[2]
-        parts = [(rows, _play(pushes[rows], values, Change())) for rows in groups_of(pushes).values()]
-        found = np.zeros((len(pushes), 3))
-        for rows, played in parts:
-            found[rows] = played
-        return ((found - truth) / SCALE).ravel()
+        return ((SlidingTwin(whole(values)).predict(pushes) - truth) / SCALE).ravel()
 
     truth = pushes.displacement()
-    values, best, damping = mean.copy(), np.inf, 1e-2
+    values, damping = mean.copy(), 1e-2
     for _ in range(ITERATIONS):
         errors = residuals(values)
-        slopes = np.stack([(residuals(values + step) - errors) / STEP[k] for k, step in _steps(free)], axis=1)
+        steps = STEP * np.eye(len(NAMES))
+        slopes = np.stack([(residuals(values + steps[k]) - errors) / STEP[k] for k in free], axis=1)
         # Student's t with two degrees of freedom: a push that went another way counts little.
         weights = 3 / (2 + errors**2)
         best = _cost(errors, values, mean, std, free)
@@ -177,12 +170,7 @@ def _fit(
             damping *= 10
         else:
             break
-    values[2] = values[1] if tied else values[2]
-    return values
-
-
-def _steps(free: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    return [(int(k), STEP[k] * np.eye(len(NAMES))[k]) for k in free]
+    return whole(values)
 
 
 def _cost(

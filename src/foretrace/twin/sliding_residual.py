@@ -5,9 +5,7 @@ image are both learned from. Each network leaves a fold of the pushes out; on it
 regions are made of.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import shapely
@@ -16,7 +14,8 @@ from jaxtyping import Float, Int
 from torch import nn
 
 from foretrace.errors import PredictionError
-from foretrace.interactions.pushes import RecordedPushes, turned, wrapped
+from foretrace.geometry import rotate_plane, wrap_angle
+from foretrace.interactions.pushes import RecordedPushes
 from foretrace.twin.sliding import Change, SlidingTwin
 
 UNITS = np.array([0.003, 0.003, np.deg2rad(4.0)])
@@ -67,7 +66,7 @@ def push_errors(
 ) -> Float[np.ndarray, "pushes 2"]:
     """Distance [m] and angle [rad] between predicted and recorded poses after the pushes."""
     distance = np.linalg.norm(found[:, :2] - truth[:, :2], axis=1)
-    return np.column_stack([distance, np.abs(wrapped(found[:, 2] - truth[:, 2]))])
+    return np.column_stack([distance, np.abs(wrap_angle(found[:, 2] - truth[:, 2]))])
 
 
 class PushResidual:
@@ -86,7 +85,7 @@ class PushResidual:
         self.share = 1.0
         """Share of the learned correction that is used: what did best on pushes that were left out."""
 
-    def fit(self, pushes: RecordedPushes, progress: Callable[[], Any] = lambda: None) -> "PushResidual":
+    def fit(self, pushes: RecordedPushes) -> "PushResidual":
         """Learn from recorded pushes.
 
         Raises:
@@ -116,7 +115,6 @@ class PushResidual:
             )
             self._networks.append(network)
             left_out[~seen] = _apply(network, self._scaled(inputs.values[~seen]))
-            progress()
         costs = [_cost(base + share * left_out - truth) for share in SHARES]
         self.share = SHARES[int(np.argmin(costs))] if self.twin is not None else 1.0
         found = _in_object_frame(pushes, base + self.share * left_out)
@@ -191,7 +189,7 @@ def _axes(pushes: RecordedPushes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _in_push_frame(pushes: RecordedPushes, displacement: np.ndarray) -> np.ndarray:
     """Displacement of the object's centre along the push and to its left, and turn, in `UNITS`."""
     ahead, left, centre = _axes(pushes)
-    moved = displacement[:, :2] + turned(centre, displacement[:, 2]) - centre
+    moved = displacement[:, :2] + rotate_plane(centre, displacement[:, 2]) - centre
     return (
         np.column_stack([(moved * ahead).sum(axis=1), (moved * left).sum(axis=1), displacement[:, 2]]) / UNITS
     )
@@ -201,7 +199,7 @@ def _in_object_frame(pushes: RecordedPushes, values: np.ndarray) -> np.ndarray:
     ahead, left, centre = _axes(pushes)
     along, across, turn = (values * UNITS).T
     moved = along[:, None] * ahead + across[:, None] * left
-    return np.column_stack([moved + centre - turned(centre, turn), turn])
+    return np.column_stack([moved + centre - rotate_plane(centre, turn), turn])
 
 
 def _geometry(pushes: RecordedPushes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -229,7 +227,7 @@ def _own_features(pushes: RecordedPushes, names: list[str]) -> np.ndarray:
     known = np.array([names.index(shape.name) if shape.name in names else -1 for shape in pushes.shapes])
     which = (known[pushes.shape][:, None] == np.arange(len(names))).astype(float)
     place = np.column_stack([(pushes.start - centre) / 0.03, ahead, np.ones(len(pushes))])
-    on_table = turned(ahead, pushes.before[:, 2])
+    on_table = rotate_plane(ahead, pushes.before[:, 2])
     return np.column_stack([(which[:, :, None] * place[:, None]).reshape(len(pushes), -1), on_table])
 
 

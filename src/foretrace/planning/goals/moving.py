@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from foretrace.actions.lever_up import APPROACH
 from foretrace.errors import PlanningError, fault, is_number, shown
-from foretrace.geometry import finite_array
+from foretrace.geometry import finite_array, wrap_angle
 from foretrace.planning.goals.base import (
     ANGLE,
     LENGTH,
@@ -91,7 +91,7 @@ class MoveTo(Goal):
         if self.turn is None:
             return apart, np.zeros_like(apart)
         off = motions.heading - self.turn
-        return apart, np.abs((off + np.pi) % (2 * np.pi) - np.pi)
+        return apart, np.abs(wrap_angle(off))
 
     def check(self, outline: Float[np.ndarray, "corners 2"]) -> None:
         """The place is near enough for one action."""
