@@ -11,10 +11,14 @@ def studio(
     data: Path | None = None,
     at: str = "",
     dark: bool = False,
+    export: Path | None = None,
+    onnxruntime_web: Path | None = None,
 ) -> None:
     """Try lever-ups in the browser: draw an object, drag the screwdriver round it, plan. Needs foretrace[studio].
 
     Every visitor has a page of their own. By default nobody but this machine reaches it.
+
+    With --export nothing is served: a folder is written whose page predicts in the browser, without a server.
 
     Args:
         host: Address to listen at; 0.0.0.0 lets other machines in, whoever they are.
@@ -22,7 +26,18 @@ def studio(
         data: Data set whose objects can be chosen.
         at: What is chosen at first, as the end of a link that the studio makes.
         dark: Dark page.
+        export: Folder to write a page to that needs no server: draw, drag, futures, regions.
+        onnxruntime_web: For --export: folder of the unpacked npm package onnxruntime-web; by default npm fetches it.
     """
+    if export is not None:
+        from foretrace.studio.static_page import write_static_page
+
+        print(write_static_page(export, onnxruntime_web))
+        return
+    if onnxruntime_web is not None:
+        raise StudioError(
+            f"--onnxruntime-web {onnxruntime_web} is of no use without --export: add it, or leave it out"
+        )
     from foretrace.interactions.dataset import Dataset
     from foretrace.studio.choices import Choices
     from foretrace.studio.server import StudioServer

@@ -78,12 +78,13 @@ class OnnxPredictor(Imaginer):
         self.ranges = known_ranges(facts["ranges"])
         """Range of each of `foretrace.imagined.domain.MEASURES` in the training part."""
         self._heights = bool(facts["config"]["feature_options"].get("heights", False))
-        self._optional = [
-            k for k, name in enumerate(self.context) if self.marginal and name in CONSTANTS
-        ]  # as `EffectPredictor.optional`
+        self.optional = [k for k, name in enumerate(self.context) if self.marginal and name in CONSTANTS]
+        """Columns of the context that need not be told, as `EffectPredictor.optional`."""
         self._times = np.array(facts["times"])
-        self._outcome = tuple(facts["futures"])
-        self._quantiles = _quantiles(facts["quantiles"])
+        self.outcome = tuple(facts["futures"])
+        """Outcome of each future."""
+        self.quantiles = _quantiles(facts["quantiles"])
+        """Quantiles of `Futures` for each start, and for a context that is told or unknown."""
 
     @property
     def name(self) -> str:
@@ -93,7 +94,7 @@ class OnnxPredictor(Imaginer):
     @property
     def learned_outcomes(self) -> tuple[str, ...]:
         """Outcomes that it distinguishes."""
-        return tuple(dict.fromkeys(self._outcome))
+        return tuple(dict.fromkeys(self.outcome))
 
     @property
     def sample_times(self) -> Float[np.ndarray, " time"]:
@@ -126,7 +127,7 @@ class OnnxPredictor(Imaginer):
             spread = np.hypot(spread, found["start_spread"].astype(float)[:, None, None])
         return Futures(
             probability=found["probability"].astype(float),
-            outcome=self._outcome,
+            outcome=self.outcome,
             states=np.concatenate([found["com_trajectory"], found["rotation_vector"]], axis=-1),
             spread=spread,
             support_points=found["support_points"].astype(float),
@@ -135,10 +136,10 @@ class OnnxPredictor(Imaginer):
 
     def _widths(self, scenes: Scenes) -> Float[np.ndarray, "*batch levels"]:
         """Quantiles for how much of the context is told; of a part of it, the larger ones."""
-        told, nothing = self._quantiles[STARTS.index(scenes.start)]
-        if not self._optional:
+        told, nothing = self.quantiles[STARTS.index(scenes.start)]
+        if not self.optional:
             return told
-        known = np.isfinite(scenes.context[:, self._optional])
+        known = np.isfinite(scenes.context[:, self.optional])
         some = np.where(known.any(axis=1, keepdims=True), np.maximum(told, nothing), nothing)
         return np.where(known.all(axis=1, keepdims=True), told, some)
 

@@ -1,0 +1,94 @@
+"""The studio's static page in headless Chromium: size, first picture, answers to a drag, numbers against Python's.
+
+Needs `pip install playwright`, Chromium and npm, or --onnxruntime-web.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from foretrace.studio.static_page import write_static_page
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+DRAG = """async (count) => {
+  const taken = [];
+  for (let k = 0; k < count; k++) {
+    const started = performance.now();
+    await Choices.imagine({ ...Choices.first(), along: k / count }, Network.run);
+    taken.push(performance.now() - started);
+  }
+  return taken;
+}"""
+
+
+def main() -> None:
+    """Print what was measured as JSON."""
+    from static_page_cases import (
+        IMAGINE,
+        as_page_choices,
+        differences,
+        imagined_in_python,
+        opened,
+        static_page_cases,
+    )
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--onnxruntime-web", type=Path, default=None)
+    parser.add_argument("--cases", type=int, default=50)
+    parser.add_argument("--opened", type=int, default=5, help="how often the page is opened")
+    parser.add_argument("--drags", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--picture", type=Path, default=None, help="PNG of the page")
+    parser.add_argument("--width", type=int, default=1280)
+    parser.add_argument("--dark", action="store_true")
+    options = parser.parse_args()
+    cases = static_page_cases(options.cases, options.seed)
+    wanted = [imagined_in_python(each) for each in cases]
+    looks: dict[str, Any] = {
+        "viewport": {"width": options.width, "height": round(options.width * 0.6)},
+        "color_scheme": "dark" if options.dark else "light",
+    }
+    first, found, taken = [], [], []
+    with TemporaryDirectory() as folder:
+        page = write_static_page(Path(folder), options.onnxruntime_web)
+        size = sum(file.stat().st_size for file in Path(folder).iterdir())
+        for number in range(options.opened):
+            with opened(page, **looks) as visited:
+                first.append(visited.evaluate("performance.getEntriesByName('first picture')[0].startTime"))
+                if number:
+                    continue
+                found = visited.evaluate(IMAGINE, [as_page_choices(each) for each in cases])
+                taken = visited.evaluate(DRAG, options.drags)
+                if options.picture is not None:
+                    visited.uncheck("#play")
+                    visited.evaluate("document.getElementById('time').value = 2.0")
+                    visited.evaluate("location.hash = 'along:0.79,friction:unknown,tool_friction:unknown'")
+                    visited.wait_for_timeout(1500)
+                    visited.screenshot(path=options.picture)
+    both = [(page, python) for page, python in zip(found, wanted, strict=True) if page and python]
+    apart = [differences(*pair) for pair in both]
+    print(
+        json.dumps(
+            {
+                "size_mb": size / 1e6,
+                "first_picture_s": [each / 1000 for each in first],
+                "imagined_ms": {"median": np.median(taken), "p95": np.quantile(taken, 0.95), "n": len(taken)},
+                "cases": len(cases),
+                "refused_alike": sum(
+                    page is None and python is None for page, python in zip(found, wanted, strict=True)
+                ),
+                "compared": len(both),
+                "largest_difference": {name: max(each[name] for each in apart) for name in apart[0]},
+            },
+            indent=2,
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
