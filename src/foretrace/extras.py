@@ -12,6 +12,7 @@ EXTRA_OF = {
     **dict.fromkeys(("av", "imageio_ffmpeg"), "video"),
     **dict.fromkeys(("onnx", "onnxscript"), "onnx"),
     **dict.fromkeys(("fastapi", "uvicorn", "viser"), "studio"),
+    **dict.fromkeys(("mujoco_warp", "warp"), "warp"),
     "gymnasium": "gym",
 }
 """The extra that brings each optional library, by the name under which that is imported."""

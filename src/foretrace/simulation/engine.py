@@ -1,7 +1,8 @@
 """The contract of a physics engine, and every engine by its name."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -29,6 +30,24 @@ FreePlay = tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"]]
 """Poses of the object frame, and velocities of the centre of mass and about it, table frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class Play:
+    """One action to play: the arguments of `Engine.play`."""
+
+    obj: ObjectModel
+    """The object."""
+    T_action_object: Float[np.ndarray, "4 4"]
+    """Pose of the object frame at rest in the action frame."""
+    tool: Tool
+    """The tool."""
+    tool_motion: ToolMotion
+    """Pose of the tool over time."""
+    duration: float
+    """Time to play [s]."""
+    physics: Physics
+    """Friction and density."""
+
+
 class Engine(ABC):
     """Plays what a tool does to an object; it knows no action.
 
@@ -40,6 +59,8 @@ class Engine(ABC):
     """Name in records and commands."""
     library: ClassVar[str]
     """Distribution whose version shapes the numbers."""
+    at_once: ClassVar[int] = 1
+    """Actions that it is fastest to play in one call of `play_many`."""
 
     @abstractmethod
     def __init__(self, embodiment: str, timestep: float, sample_period: float) -> None: ...
@@ -73,6 +94,10 @@ class Engine(ABC):
             ActionError: The arm cannot follow the tool's motion.
         """
 
+    def play_many(self, plays: Sequence[Play]) -> list[Motion]:
+        """Plays actions that have nothing to do with each other, in their order; raises as `play` does."""
+        return [self.play(**vars(play)) for play in plays]
+
     @staticmethod
     @abstractmethod
     def play_freely(
@@ -90,6 +115,7 @@ ENGINES: Registry[type[Engine]] = Registry("engine", "foretrace.engines", Simula
 """Every engine by its name; the built-in ones are imported on first use."""
 ENGINES.declare("mujoco", "foretrace.simulation.mujoco_engine")
 ENGINES.declare("bullet", "foretrace.simulation.bullet_engine")
+ENGINES.declare("warp", "foretrace.simulation.warp_engine")
 
 
 @lru_cache(maxsize=4)

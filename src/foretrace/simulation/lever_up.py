@@ -1,6 +1,8 @@
 """Simulate an action, and record its effect (paper, section 4)."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,7 +37,7 @@ from foretrace.interactions.record import (
 )
 from foretrace.interactions.topdown import METRES_PER_PIXEL, TopDownView
 from foretrace.objects import ObjectModel
-from foretrace.simulation.engine import make_engine
+from foretrace.simulation.engine import Engine, Play, make_engine
 
 CAMERAS = ("exact", "grid", "rgbd")
 """``exact``: pixels aligned with the action. ``grid``: pixels that lie and are turned at random, as those of a camera
@@ -96,6 +98,67 @@ class SimulationConfig:
             )
 
 
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One action to simulate: the arguments of `simulate_lever_up`."""
+
+    obj: ObjectModel
+    action: Action
+    config: SimulationConfig = SimulationConfig()
+    seed: int = 0
+    id: int = 0
+    execution_error: ExecutionOffset = NO_OFFSET
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.action, Action):
+            raise ActionError(
+                f"action of type {type(self.action).__name__}: give a LeverUp or another Action"
+            )
+        check_type("obj", self.obj, ObjectModel, SimulationError)
+        check_type("config", self.config, SimulationConfig, SimulationError)
+        check_type("execution_error", self.execution_error, ExecutionOffset, SimulationError)
+        if not is_whole(self.seed, 0, LARGEST_SEED):
+            raise SimulationError(f"seed is {shown(self.seed)}: give a whole number from 0 to {LARGEST_SEED}")
+
+    @cached_property
+    def executed(self) -> Action:
+        """The action as it is executed."""
+        error = self.execution_error
+        return self.action if error == NO_OFFSET else self.action.moved(**asdict(error))
+
+    def view(self) -> TopDownView:
+        """What the camera sees before."""
+        self.action.check_contact(self.obj)
+        if self.config.camera == "exact":
+            return TopDownView.of(self.obj, self.action)
+        if self.config.camera == "grid":
+            return view_on_grid(self.obj, self.action, self.seed)
+        # Loads OpenGL, which the exact camera does without.
+        from foretrace.simulation.camera import take_rgbd
+
+        return take_rgbd(self.obj, self.action, seed=self.seed).view()
+
+    def play(self) -> Play:
+        """What an engine plays."""
+        executed = self.executed
+        motion, duration = executed.tool_motion, executed.duration + self.config.watch_time
+        return Play(self.obj, executed.T_action_object, executed.tool, motion, duration, self.config.physics)
+
+    def record(self, view: TopDownView, motion: Motion, engine: Engine) -> Interaction:
+        """The record of the motion, in the frame of the action as commanded."""
+        executed = self.executed
+        effect = effect_of(motion, self.obj, executed, self.config.physics)
+        if executed is not self.action:
+            effect = _transformed(
+                effect, self.action.T_action_object @ invert_transform(executed.T_action_object)
+            )
+        made = {name: getattr(self.config, name) for name in SETTINGS}
+        versions = versions_of("foretrace", "numpy", engine.library)
+        provenance = Provenance(seed=self.seed, versions=versions, **made)
+        known = (self.obj, self.action, view, effect, self.config.physics, provenance)
+        return Interaction(*known, self.execution_error, self.id)
+
+
 def simulate_lever_up(
     obj: ObjectModel,
     action: Action,
@@ -124,34 +187,24 @@ def simulate_lever_up(
         ActionError: If the contact is not on the outline, or the arm cannot follow the path.
         ViewError: If the object does not fit in the view.
     """
-    if not isinstance(action, Action):
-        raise ActionError(f"action of type {type(action).__name__}: give a LeverUp or another Action")
-    check_type("obj", obj, ObjectModel, SimulationError)
-    check_type("config", config, SimulationConfig, SimulationError)
-    check_type("execution_error", execution_error, ExecutionOffset, SimulationError)
-    if not is_whole(seed, 0, LARGEST_SEED):
-        raise SimulationError(f"seed is {shown(seed)}: give a whole number from 0 to {LARGEST_SEED}")
-    action.check_contact(obj)
-    engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
-    if config.camera == "exact":
-        view = TopDownView.of(obj, action)
-    elif config.camera == "grid":
-        view = view_on_grid(obj, action, seed)
-    else:
-        # Loads OpenGL, which the exact camera does without.
-        from foretrace.simulation.camera import take_rgbd
+    return simulate_trials([Trial(obj, action, config, seed, id, execution_error)])[0]
 
-        view = take_rgbd(obj, action, seed=seed).view()
-    executed = action if execution_error == NO_OFFSET else action.moved(**asdict(execution_error))
-    duration = executed.duration + config.watch_time
-    pose = executed.T_action_object
-    motion = engine.play(obj, pose, executed.tool, executed.tool_motion, duration, config.physics)
-    effect = effect_of(motion, obj, executed, config.physics)
-    if executed is not action:
-        effect = _transformed(effect, action.T_action_object @ invert_transform(pose))
-    made = {name: getattr(config, name) for name in SETTINGS}
-    provenance = Provenance(seed=seed, versions=versions_of("foretrace", "numpy", engine.library), **made)
-    return Interaction(obj, action, view, effect, config.physics, provenance, execution_error, id)
+
+def simulate_trials(trials: Sequence[Trial]) -> list[Interaction]:
+    """Simulates actions at once, in their order, as `simulate_lever_up` does one.
+
+    Args:
+        trials: The actions; engine, embodiment and times are those of the first one's configuration.
+    """
+    if not trials:
+        return []
+    config = trials[0].config
+    engine = make_engine(config.engine, config.embodiment, config.timestep, config.sample_period)
+    views = [trial.view() for trial in trials]
+    motions = engine.play_many([trial.play() for trial in trials])
+    return [
+        trial.record(view, motion, engine) for trial, view, motion in zip(trials, views, motions, strict=True)
+    ]
 
 
 def view_on_grid(obj: ObjectModel, action: Action, seed: int) -> TopDownView:
