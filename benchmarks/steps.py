@@ -105,7 +105,9 @@ def main() -> None:
     for id in np.linspace(0, num_trials(config) - 1, arguments.lever_ups).astype(int).tolist():
         obj, action, seed = trial(config, id)
         mujoco_engine.build_scene = BUILD
-        simulate_lever_up(obj, action, SimulationConfig(embodiment=arguments.embodiment))  # what is kept is there
+        simulate_lever_up(
+            obj, action, SimulationConfig(embodiment=arguments.embodiment)
+        )  # what is kept is there
         base = None
         for name, (build, timestep) in VARIANTS.items():
             one = Trial(
