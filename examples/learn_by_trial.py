@@ -1,7 +1,6 @@
 """Reinforcement learning against planning: run with ``python learn_by_trial.py [STEPS] [EPISODES]``.
 
-PPO of stable-baselines3 (``pip install stable-baselines3``) levers up objects for minutes and learns from the reward.
-Then it, a random agent, a rule and the planner face the same objects, which nobody has seen.
+PPO (``pip install stable-baselines3``) levers up objects for minutes. Then it and others face the same unseen objects.
 """
 
 import json
@@ -14,8 +13,7 @@ from stable_baselines3 import PPO
 import foretrace as ft
 from foretrace.environment import LeverUpEnv, observed_view
 
-DIRECTIONS = 36
-FIRST_UNSEEN = 1_000_000
+DIRECTIONS, FIRST_UNSEEN = 36, 1_000_000
 
 
 class Outline(gymnasium.ObservationWrapper):
@@ -28,7 +26,7 @@ class Outline(gymnasium.ObservationWrapper):
     def observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         outline = observed_view(observation).contour()
         points = outline - outline.mean(axis=0)
-        sector = np.floor(np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) * DIRECTIONS).astype(int)
+        sector = np.floor(np.arctan2(points[:, 1], points[:, 0]) * DIRECTIONS / (2 * np.pi)).astype(int)
         far = np.zeros(DIRECTIONS, np.float32)
         np.maximum.at(far, sector % DIRECTIONS, 10 * np.linalg.norm(points, axis=1))
         return far
@@ -59,5 +57,4 @@ def main() -> None:
     print(json.dumps({name: round(float(np.mean(values)), 4) for name, values in rewards.items()}))
 
 
-if __name__ == "__main__":
-    main()
+main()

@@ -8,6 +8,7 @@ Numbers are single precision, and a GPU adds in no fixed order: motions are not 
 """
 
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -75,7 +76,7 @@ class WarpEngine(MujocoEngine):
                 "embodiment 'tool'"
             )
         with named_extras():
-            import mujoco_warp  # noqa: F401
+            import_module("mujoco_warp")
         super().__init__(embodiment, timestep, sample_period)
 
     def play(self, *arguments: Any, **named: Any) -> Motion:
@@ -117,9 +118,7 @@ class WarpEngine(MujocoEngine):
         self, plays: Sequence[Play], controls: Sequence[ControlPath]
     ) -> Float[np.ndarray, "world sample state"]:
         """States of every world at every sample, in MuJoCo's order: time, positions, velocities."""
-        import mujoco_warp as mjw
-        import warp as wp
-
+        mjw, wp = import_module("mujoco_warp"), import_module("warp")
         template, fields = self._worlds(plays, controls[0].coordinates)
         num, stride = len(plays), round(self.sample_period / self.timestep)
         pieces = template.ngeom
