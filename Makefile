@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/installed
 LOCKED := $(BIN)/pip install --quiet --require-hashes --no-deps
-OPTIONAL := ^(pybullet|pyrealsense2|rerun-sdk|rosbags|ur-rtde|onnx|onnxscript)==
+OPTIONAL := ^(pybullet|pyrealsense2|ray|rerun-sdk|rosbags|ur-rtde|onnx|onnxscript)==
 
 # `make quick`: these files without their slow tests, under 45 seconds on two idle cores.
 QUICK := actions arm checkpoint cli dataset features geometry golden lever_up meshes objects predictor solids splits \

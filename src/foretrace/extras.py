@@ -14,6 +14,7 @@ EXTRA_OF = {
     **dict.fromkeys(("fastapi", "uvicorn", "viser"), "studio"),
     **dict.fromkeys(("mujoco_warp", "warp"), "warp"),
     "gymnasium": "gym",
+    "ray": "ray",
 }
 """The extra that brings each optional library, by the name under which that is imported."""
 

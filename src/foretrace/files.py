@@ -293,9 +293,14 @@ def sole_writer(folder: Path, error: type[ForetraceError] = ForetraceError) -> I
         yield
 
 
-def remove_partial(folder: Path) -> list[Path]:
-    """Remove what interrupted writes left in a folder; returns what was removed."""
-    leftovers = partial_files(folder)
+def remove_partial(folder: Path, everywhere: bool = False) -> list[Path]:
+    """Remove what interrupted writes left in a folder; returns what was removed.
+
+    Args:
+        folder: The folder.
+        everywhere: Remove what other processes and machines write, too: they must be known to have ended.
+    """
+    leftovers = sorted(folder.glob(f"*{PARTIAL}")) if everywhere else partial_files(folder)
     for file in leftovers:
         _remove(file)
     return leftovers

@@ -1,4 +1,4 @@
-"""The one way to run many jobs: local processes, progress on the console, Ctrl-C, workers that are killed."""
+"""The one way to run many jobs: local processes or a Ray cluster, progress, Ctrl-C, workers that are killed."""
 
 import ctypes
 import os
@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
+from contextvars import ContextVar
 from multiprocessing import resource_tracker
 from typing import Any, TypeVar, cast
 
@@ -17,12 +18,14 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from foretrace.cluster import Cluster
 from foretrace.errors import ForetraceError, is_whole, shown
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MOST_WORKERS = 1024
+MOST_ON_CLUSTER = 100_000
 PARENT_PERIOD = 1.0
 """Seconds between two looks of a worker at whether its parent lives."""
 PR_SET_PDEATHSIG = 1
@@ -30,17 +33,50 @@ PR_SET_PDEATHSIG = 1
 PLAIN_REPORT_PERIOD = 10.0
 """Seconds between two lines of progress where there is no terminal."""
 
+_cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
+
+
+@contextmanager
+def on_cluster(address: str | None) -> Iterator[None]:
+    """Let a Ray cluster do the work of `run_jobs` within a block.
+
+    Files that are read and written must be in folders that every node has at the same place.
+
+    Args:
+        address: ``HOST:PORT`` of a cluster that this machine belongs to, ``ray://HOST:PORT`` of another one,
+            ``local:N`` for N processes of this machine; None for local processes without Ray, as outside of the block.
+
+    Raises:
+        ForetraceError: There is no such cluster, it does not answer, or Ray is not installed.
+    """
+    if address is None:
+        yield
+        return
+    with Cluster(address) as cluster:
+        token = _cluster.set(cluster)
+        try:
+            yield
+        finally:
+            _cluster.reset(token)
+
+
+def uses_cluster() -> bool:
+    """Whether `run_jobs` uses a cluster: results should then be small, and files be written by the jobs."""
+    return _cluster.get() is not None
+
 
 def count_workers(workers: int | None, error: type[ForetraceError]) -> int:
-    """Number of processes: by default one for each core.
+    """Number of processes: by default one for each core, of this machine or of all nodes of the cluster.
 
     Raises:
         ForetraceError: Of the given class: the number is out of range.
     """
+    cluster = _cluster.get()
     if workers is None:
-        return cpu_count()
-    if not is_whole(workers, 1, MOST_WORKERS):
-        raise error(f"workers is {shown(workers)}: give a number from 1 to {MOST_WORKERS}")
+        return cpu_count() if cluster is None else max(1, cluster.cpus)
+    most = MOST_WORKERS if cluster is None else MOST_ON_CLUSTER
+    if not is_whole(workers, 1, most):
+        raise error(f"workers is {shown(workers)}: give a number from 1 to {most}")
     return workers
 
 
@@ -57,11 +93,12 @@ def run_jobs(
     """Results of a function over many jobs, each as soon as it is there.
 
     The processes never hear Ctrl-C: this one stops them. When this one is killed they end, whatever they are doing.
+    Where a local one is killed the work ends; within `on_cluster`, another one does its job again.
 
     Args:
         function: Runs one job in any process: a function or a picklable object, whose result depends on the job alone.
         jobs: The jobs, begun in this order.
-        workers: Processes; with one, the work is done in this process.
+        workers: Processes; with one, the work is done in this process, or by one of the cluster.
         error: Class to raise when a process is killed.
         threads: Threads of numerical libraries in each process.
         ordered: Whether results come in the order of the jobs; otherwise, in the order in which they are finished.
@@ -70,6 +107,12 @@ def run_jobs(
     Raises:
         ForetraceError: Of the given class: a process was killed; or any that the function raises.
     """
+    if (cluster := _cluster.get()) is not None:
+        factor = 1 if ahead == "n_jobs" else 2
+        options: Any = {"error": error, "threads": threads, "ordered": ordered, "ahead": factor}
+        with closing(cluster.run(function, jobs, workers, **options)) as results:
+            yield from results
+        return
     begin = {"initializer": _begin_worker, "initargs": (os.getpid(),)}
     num = max(1, min(workers, len(jobs)))
     with (
@@ -177,6 +220,8 @@ class ProgressReport:
         now = time.monotonic()
         rate = (self._done - self._before) / max(now - self._begun, 1e-9)
         speed = f"{rate:.1f}/s" if rate >= 0.1 else f"{60 * rate:.1f}/min"
+        if (cluster := _cluster.get()) is not None:
+            speed = f"{speed} on {cluster}"
         self._bar.update(self._task, completed=self._done, description=f"{speed}  {text}")
         if not self.console.is_terminal and now - self._last_line >= self._period:
             self._last_line = now

@@ -35,10 +35,11 @@ def _command(label: str) -> Callable[..., int]:
         out: Path | None = None,
         workers: int | None = None,
         threads: int = 1,
+        cluster: str | None = None,
         dry_run: bool = False,
         redraw: bool = False,
     ) -> int:
-        return _evaluate(experiment, out, workers, threads, dry_run, redraw)
+        return _evaluate(experiment, out, workers, threads, cluster, dry_run, redraw)
 
     evaluate.__annotations__["experiment"] = Annotated[kind, tyro.conf.arg(name="")]
     keeps = "" if kind.needs_folder else "; by default nothing is kept"
@@ -53,6 +54,8 @@ def _command(label: str) -> Callable[..., int]:
         out: Folder to write to: rows.csv, summary.json, report.md and figures{keeps}.
         workers: Processes; by default {usual}.
         threads: Threads of numerical libraries in each process.
+        cluster: Address of a Ray cluster that carries out the trials, all of whose nodes share --out and the data:
+            HOST:PORT, ray://HOST:PORT, or local:N.
         dry_run: Print the number of missing trials, and run nothing.
         redraw: Run nothing: summarise, report and draw the rows in --out again.
     """
@@ -60,16 +63,24 @@ def _command(label: str) -> Callable[..., int]:
 
 
 def _evaluate(
-    experiment: "Experiment", out: Path | None, workers: int | None, threads: int, dry_run: bool, redraw: bool
+    experiment: "Experiment",
+    out: Path | None,
+    workers: int | None,
+    threads: int,
+    cluster: str | None,
+    dry_run: bool,
+    redraw: bool,
 ) -> int:
     from foretrace.evaluation.run import count_missing, run_experiment
+    from foretrace.workers import on_cluster
 
     if dry_run:
         for name, count in count_missing(experiment, out).items():
             print(f"{name:20s} {count:5d} trials missing")
         return 0
     try:
-        results = run_experiment(experiment, out, workers, threads, redraw=redraw)
+        with on_cluster(cluster):
+            results = run_experiment(experiment, out, workers, threads, redraw=redraw)
     except KeyboardInterrupt:
         if out is not None:
             say(f"interrupted; finished trials stay in {out}, the same command goes on from there")

@@ -12,6 +12,7 @@ from foretrace.cli.parsing import adapt
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED
+from foretrace.workers import on_cluster
 
 ROLLING_TIME = 1.5
 """Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
@@ -27,6 +28,7 @@ def simulate(
     off_centre: bool = False,
     exact_share: float = 0.0,
     workers: int | None = None,
+    cluster: str | None = None,
 ) -> None:
     """Simulate lever-ups of many objects into a data set.
 
@@ -44,6 +46,8 @@ def simulate(
         exact_share: Share of the lever-ups whose contact is as commanded, with --randomise.
         off_centre: Move the centre of mass of half the prisms and boxes away from the middle.
         workers: Number of processes; by default one for each core.
+        cluster: Address of a Ray cluster that does the work: HOST:PORT, ray://HOST:PORT, or local:N. All nodes must
+            share the folder.
     """
     if watch_time is None:
         watch_time = 0.0 if config.recipe == "paper" else ROLLING_TIME
@@ -56,7 +60,10 @@ def simulate(
         randomisation = replace(randomisation, com_offset=LARGEST_COM_OFFSET)
     simulation = replace(config.simulation, watch_time=watch_time)
     config = replace(config, simulation=simulation, randomisation=randomisation)
-    with when_interrupted(f"what is done stays in {out}, the same command goes on from there"):
+    with (
+        when_interrupted(f"what is done stays in {out}, the same command goes on from there"),
+        on_cluster(cluster),
+    ):
         counts = collect(config, out, workers)
     print_outcomes(counts)
     print(f"data set: {out}")

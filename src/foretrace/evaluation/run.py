@@ -26,7 +26,7 @@ from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.storage import Rows, Store, kept_identity, table_of
 from foretrace.files import as_json, versions_of
 from foretrace.predictor.run_folder import git_commit
-from foretrace.workers import ProgressReport, count_workers, run_jobs
+from foretrace.workers import ProgressReport, count_workers, run_jobs, uses_cluster
 
 LIBRARIES = ("foretrace", "torch", "numpy", "mujoco", "pybullet")
 
@@ -73,7 +73,7 @@ def run_experiment(
         experiment: What to carry out.
         out: Folder of the results: ``rows.csv``, ``summary.json``, ``report.md``, pictures, and in ``trials`` a file
             for each trial. None: nothing is kept; for experiments that are quick.
-        workers: Processes; by default what the experiment says.
+        workers: Processes; by default what the experiment says, or all of a cluster.
         threads: Threads of numerical libraries in each process.
         console: Where progress is reported; standard error by default.
         redraw: Run nothing, and ask for no data: summarise, report and draw the rows that the folder holds.
@@ -124,7 +124,7 @@ def _run(
 ) -> Results:
     if threads < 1:
         raise ResultsError(f"threads is {threads}: give a number from 1")
-    workers = experiment.workers if workers is None else workers
+    workers = experiment.workers if workers is None and not uses_cluster() else workers
     workers = count_workers(workers, ResultsError)
     trials = [] if redraw else list(dict.fromkeys(experiment.trials()))
     store = _store(experiment, out, redraw)

@@ -1,7 +1,7 @@
 """Interactions on disk: Parquet shards (one row per interaction) and a JSON manifest beside them.
 
 A shard appears under its name only when it is complete (written aside, synchronised, renamed); its checksum
-enters the manifest right after. So a crash at any moment leaves whole shards, at most one without a checksum.
+enters the manifest soon after. So a crash at any moment leaves whole shards, the last ones without a checksum.
 Positions and angles are kept as float64, exactly as observed; the height map in steps of 0.1 mm.
 """
 

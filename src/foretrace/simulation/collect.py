@@ -6,6 +6,7 @@ whatever order.
 """
 
 import platform
+import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -39,14 +40,16 @@ from foretrace.simulation.engine import ENGINES
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import NOTHING, Randomisation
 from foretrace.simulation.recipes import RECIPES
-from foretrace.workers import ProgressReport, count_workers, run_jobs
+from foretrace.workers import ProgressReport, count_workers, run_jobs, uses_cluster
 
 MOST = 1_000_000
 """Objects, and contacts at each edge, that a data set may have."""
 SHARD_SIZE = 100
 """Interactions in one file."""
 CHUNK_SIZE = 10
-"""Interactions that a worker hands over at once."""
+"""Interactions that a local worker hands over at once; those of a cluster write whole shards themselves."""
+MANIFEST_PERIOD = 1.0
+"""Seconds between two updates of the manifest: of shards that are written in between, a crash loses the checksum."""
 RANDOMISATION_STREAM = 2
 """Tells the random numbers of what varies from those of objects, contact points and cameras."""
 
@@ -179,8 +182,15 @@ def collect(
         manifest = _open_manifest(config, out, console)
         counts, todo = _take_stock(out, manifest, console)
         with ProgressReport("interactions", manifest["num_trials"], counts.total(), console) as report:
-            for name, table in _simulate_shards(config, todo, workers, simulate, counts, report):
-                manifest["shards"][name] = storage.write_shard(out, name, table)
+            make = _simulate_on_cluster if uses_cluster() else _simulate_shards
+            written = time.monotonic()
+            try:
+                for name, entry in make(config, out, todo, workers, simulate, counts, report):
+                    manifest["shards"][name] = entry
+                    if time.monotonic() - written > MANIFEST_PERIOD:
+                        storage.write_manifest(out, manifest)
+                        written = time.monotonic()
+            finally:
                 storage.write_manifest(out, manifest)
     return count_outcomes(list(counts.elements()))
 
@@ -228,7 +238,7 @@ def _take_stock(
     A shard without a checksum (the crash came before the manifest's update) is kept if it is whole.
     """
     for folder in (out, out / storage.SHARD_FOLDER):
-        remove_partial(folder)
+        remove_partial(folder, everywhere=uses_cluster())
     counts: Counter[str] = Counter()
     todo: dict[str, range] = {}
     total, size = manifest["num_trials"], manifest["shard_size"]
@@ -254,25 +264,49 @@ def _take_stock(
 
 def _simulate_shards(
     config: CollectConfig,
+    out: Path,
     todo: dict[str, range],
     workers: int,
     simulate: Callable[[CollectConfig, int], Interaction],
     counts: Counter[str],
     report: ProgressReport,
-) -> Iterator[tuple[str, pa.Table]]:
-    """The shards to do, each as soon as all of its chunks are there."""
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names and entries of the shards to do, each written as soon as all of its chunks are there."""
     chunks = [
         (name, ids[k : k + CHUNK_SIZE]) for name, ids in todo.items() for k in range(0, len(ids), CHUNK_SIZE)
     ]
     parts: dict[str, list[pa.Table]] = {name: [] for name in todo}
     function = partial(_simulate_chunk, simulate, config)
     for name, table in run_jobs(function, chunks, workers, error=SimulationError):
-        counts.update(table["outcome"].to_pylist())
-        outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.most_common())
-        report.add(table.num_rows, outcomes)
+        _count(Counter(table["outcome"].to_pylist()), counts, report)
         parts[name].append(table)
         if sum(part.num_rows for part in parts[name]) == len(todo[name]):
-            yield name, pa.concat_tables(sorted(parts.pop(name), key=_first_id))
+            yield (
+                name,
+                storage.write_shard(out, name, pa.concat_tables(sorted(parts.pop(name), key=_first_id))),
+            )
+
+
+def _simulate_on_cluster(
+    config: CollectConfig,
+    out: Path,
+    todo: dict[str, range],
+    workers: int,
+    simulate: Callable[[CollectConfig, int], Interaction],
+    counts: Counter[str],
+    report: ProgressReport,
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names and entries of the shards to do, each written by the node that simulates it."""
+    function = partial(_simulate_shard, simulate, config, out)
+    for name, entry, found in run_jobs(function, list(todo.items()), workers, error=SimulationError):
+        _count(found, counts, report)
+        yield name, entry
+    remove_partial(out / storage.SHARD_FOLDER, everywhere=True)  # of processes that were killed
+
+
+def _count(found: Counter[str], counts: Counter[str], report: ProgressReport) -> None:
+    counts.update(found)
+    report.add(found.total(), ", ".join(f"{count} {outcome}" for outcome, count in counts.most_common()))
 
 
 def _first_id(table: pa.Table) -> int:
@@ -292,6 +326,21 @@ def _simulate_chunk(
             raise SimulationError(f"trial {id} cannot be simulated: {error}") from error
         rows.append(storage.encode(interaction, object_id=_locate(config, id)[0]))
     return name, storage.to_table(rows)
+
+
+def _simulate_shard(
+    simulate: Callable[[CollectConfig, int], Interaction],
+    config: CollectConfig,
+    out: Path,
+    shard: tuple[str, range],
+) -> tuple[str, dict[str, Any], Counter[str]]:
+    """All trials of a shard, into its file; its name and entry, and how often each outcome occurs."""
+    if not (out / storage.MANIFEST).is_file():
+        raise SimulationError(
+            f"node {platform.node()} does not see {out / storage.MANIFEST}: give a folder that all nodes share"
+        )
+    name, table = _simulate_chunk(simulate, config, shard)
+    return name, storage.write_shard(out, name, table), Counter(table["outcome"].to_pylist())
 
 
 def _say(console: Console, line: str) -> None:
