@@ -8,7 +8,7 @@ OPTIONAL := ^(pybullet|pyrealsense2|ray|rerun-sdk|rosbags|ur-rtde|onnx|onnxscrip
 QUICK := actions arm checkpoint cli dataset features geometry golden lever_up meshes objects predictor solids splits \
 	statistics surface topdown trajectories windows
 
-.PHONY: setup lock audit licences dist demo test quick check bench figures checkpoint docs clean
+.PHONY: setup lock wheels audit licences dist demo test quick check bench figures checkpoint docs clean
 
 setup: $(STAMP)
 
@@ -37,6 +37,11 @@ lock:
 		--output-file requirements.lock
 	sed -i -e ':join' -e '/\\$$/{N;s/ *\\\n */ /;bjoin}' requirements.lock
 	sed -i -E '/^(nvidia|cuda|triton)-?/d' requirements.lock
+
+# Which pinned packages have no wheel for macOS or Windows.
+wheels: setup
+	$(BIN)/pip install --quiet uv
+	$(BIN)/python .ci/wheels.py
 
 audit: setup
 	test -d .venv/audit || $(PYTHON) -m venv .venv/audit
