@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 from rich.console import Console
 
 import factories
-from foretrace.actions import ToolPath
+from foretrace.actions import Motion, ToolPath
 from foretrace.errors import DatasetError, SimulationError
 from foretrace.files import PARTIAL
 from foretrace.geometry import is_convex
@@ -26,8 +27,17 @@ from foretrace.interactions.record import Interaction, Outcome
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import Box, Cylinder, Prism
 from foretrace.simulation import collect as collecting
-from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial, trial
+from foretrace.simulation.collect import (
+    CollectConfig,
+    collect,
+    num_trials,
+    planned_trial,
+    simulate_trial,
+    trial,
+)
+from foretrace.simulation.engine import Play
 from foretrace.simulation.lever_up import SimulationConfig
+from foretrace.simulation.mujoco_engine import MujocoEngine
 from foretrace.simulation.recipes import RECIPES
 
 SMALL = CollectConfig(objects=16)
@@ -135,17 +145,9 @@ def test_more_objects_begin_with_the_same_trials():
         assert trial(small, id)[2] == trial(large, id)[2]
 
 
-def test_simulate_trial_hands_everything_over(monkeypatch):
-    calls = []
-
-    def fake_simulate(obj, action, config, *, seed, id):
-        calls.append((config, seed, id))
-        return factories.fake_lever_up(obj, action, id=id, seed=seed)
-
-    monkeypatch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake_simulate)
-    interaction = simulate_trial(SMALL, 17)
-    assert calls == [(SMALL.simulation, trial(SMALL, 17)[2], 17)]
-    assert interaction.id == 17
+def test_a_planned_trial_has_everything():
+    planned = planned_trial(SMALL, 17)
+    assert (planned.config, planned.seed, planned.id) == (SMALL.simulation, trial(SMALL, 17)[2], 17)
 
 
 def test_solids_come_in_threes_with_one_mask_and_the_same_actions():
@@ -424,3 +426,23 @@ def test_a_real_interaction_is_reproducible_alone_from_its_id(tmp_path):
         np.testing.assert_array_equal(getattr(stored.effect, name), getattr(alone.effect, name))
     assert stored.effect.outcome == alone.effect.outcome
     assert stored.provenance == alone.provenance
+
+
+def test_an_engine_that_plays_many_at_once_makes_the_same_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CollectConfig(objects=1, contacts_per_edge=2, simulation=SimulationConfig(embodiment="tool"))
+    collect(config, tmp_path / "one", workers=1, console=quiet())
+    calls = []
+    one_by_one = MujocoEngine.play_many
+
+    def counted(self: MujocoEngine, plays: Sequence[Play]) -> list[Motion]:
+        calls.append(len(plays))
+        return one_by_one(self, plays)
+
+    monkeypatch.setattr(MujocoEngine, "at_once", 250)
+    monkeypatch.setattr(MujocoEngine, "play_many", counted)
+    collect(config, tmp_path / "many", workers=1, console=quiet())
+    assert calls == [6]
+    one, many = (storage.read_manifest(tmp_path / name)["shards"] for name in ("one", "many"))
+    assert one == many

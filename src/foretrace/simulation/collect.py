@@ -9,7 +9,7 @@ import platform
 import time
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -121,11 +121,11 @@ def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, Action, int]:
     return obj, action, int(seed)
 
 
-def simulate_trial(config: CollectConfig, id: int) -> Interaction:
-    """Simulate one trial, alone; the same interaction as in the data set of that configuration."""
+def planned_trial(config: CollectConfig, id: int) -> lever_up.Trial:
+    """One trial with everything that varies, ready to be simulated."""
     obj, action, seed = trial(config, id)
     if config.randomisation == NOTHING:
-        return lever_up.simulate_lever_up(obj, action, config.simulation, seed=seed, id=id)
+        return lever_up.Trial(obj, action, config.simulation, seed, id)
     rng = np.random.default_rng(
         np.random.SeedSequence([config.seed, *_locate(config, id), RANDOMISATION_STREAM])
     )
@@ -137,7 +137,12 @@ def simulate_trial(config: CollectConfig, id: int) -> Interaction:
         raise SimulationError(
             f"the path of a {action.label} cannot be varied, only a lever-up's: leave --vary-action out"
         )
-    return lever_up.simulate_lever_up(obj, action, simulation, seed=seed, id=id, execution_error=error)
+    return lever_up.Trial(obj, action, simulation, seed, id, error)
+
+
+def simulate_trial(config: CollectConfig, id: int) -> Interaction:
+    """Simulate one trial, alone; the same interaction as in the data set of that configuration."""
+    return lever_up.simulate_trials([planned_trial(config, id)])[0]
 
 
 def _locate(config: CollectConfig, id: int) -> tuple[int, int]:
@@ -272,19 +277,20 @@ def _simulate_shards(
     report: ProgressReport,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Names and entries of the shards to do, each written as soon as all of its chunks are there."""
-    chunks = [
-        (name, ids[k : k + CHUNK_SIZE]) for name, ids in todo.items() for k in range(0, len(ids), CHUNK_SIZE)
-    ]
+    at_once = _at_once(config, simulate)
+    size = min(max(at_once, CHUNK_SIZE), SHARD_SIZE)
+    chunks = [(name, ids[k : k + size]) for name, ids in todo.items() for k in range(0, len(ids), size)]
+    per_job = max(1, at_once // size)
+    jobs = [chunks[k : k + per_job] for k in range(0, len(chunks), per_job)]
     parts: dict[str, list[pa.Table]] = {name: [] for name in todo}
-    function = partial(_simulate_chunk, simulate, config)
-    for name, table in run_jobs(function, chunks, workers, error=SimulationError):
-        _count(Counter(table["outcome"].to_pylist()), counts, report)
-        parts[name].append(table)
-        if sum(part.num_rows for part in parts[name]) == len(todo[name]):
-            yield (
-                name,
-                storage.write_shard(out, name, pa.concat_tables(sorted(parts.pop(name), key=_first_id))),
-            )
+    function = partial(_simulate_chunks, simulate, config)
+    for made in run_jobs(function, jobs, workers, error=SimulationError):
+        for name, table in made:
+            _count(Counter(table["outcome"].to_pylist()), counts, report)
+            parts[name].append(table)
+            if sum(part.num_rows for part in parts[name]) == len(todo[name]):
+                whole = pa.concat_tables(sorted(parts.pop(name), key=_first_id))
+                yield name, storage.write_shard(out, name, whole)
 
 
 def _simulate_on_cluster(
@@ -313,19 +319,41 @@ def _first_id(table: pa.Table) -> int:
     return table["id"][0].as_py()
 
 
-def _simulate_chunk(
-    simulate: Callable[[CollectConfig, int], Interaction], config: CollectConfig, chunk: tuple[str, range]
-) -> tuple[str, pa.Table]:
-    """Some trials of a shard."""
-    name, ids = chunk
-    rows = []
-    for id in ids:
+def _at_once(config: CollectConfig, simulate: Callable[[CollectConfig, int], Interaction]) -> int:
+    """How many trials to hand to the engine in one call."""
+    return ENGINES.find(config.simulation.engine).at_once if simulate is simulate_trial else 1
+
+
+def _simulate_chunks(
+    simulate: Callable[[CollectConfig, int], Interaction],
+    config: CollectConfig,
+    chunks: Sequence[tuple[str, range]],
+) -> list[tuple[str, pa.Table]]:
+    """Some trials of each of some shards."""
+    if _at_once(config, simulate) > 1:
+        ids = [id for _, some in chunks for id in some]
         try:
-            interaction = simulate(config, id)
+            made = iter(lever_up.simulate_trials([planned_trial(config, id) for id in ids]))
         except ForetraceError as error:
-            raise SimulationError(f"trial {id} cannot be simulated: {error}") from error
-        rows.append(storage.encode(interaction, object_id=_locate(config, id)[0]))
-    return name, storage.to_table(rows)
+            raise SimulationError(f"trials {ids[0]} to {ids[-1]} cannot be simulated: {error}") from error
+    else:
+        made = (_simulate_one(simulate, config, id) for _, some in chunks for id in some)
+    return [
+        (
+            name,
+            storage.to_table([storage.encode(next(made), object_id=_locate(config, id)[0]) for id in some]),
+        )
+        for name, some in chunks
+    ]
+
+
+def _simulate_one(
+    simulate: Callable[[CollectConfig, int], Interaction], config: CollectConfig, id: int
+) -> Interaction:
+    try:
+        return simulate(config, id)
+    except ForetraceError as error:
+        raise SimulationError(f"trial {id} cannot be simulated: {error}") from error
 
 
 def _simulate_shard(
@@ -339,7 +367,7 @@ def _simulate_shard(
         raise SimulationError(
             f"node {platform.node()} does not see {out / storage.MANIFEST}: give a folder that all nodes share"
         )
-    name, table = _simulate_chunk(simulate, config, shard)
+    ((name, table),) = _simulate_chunks(simulate, config, [shard])
     return name, storage.write_shard(out, name, table), Counter(table["outcome"].to_pylist())
 
 

@@ -76,6 +76,7 @@ class WarpEngine(MujocoEngine):
                 "embodiment 'tool'"
             )
         with named_extras():
+            import_module("warp").config.quiet = True
             import_module("mujoco_warp")
         super().__init__(embodiment, timestep, sample_period)
 
