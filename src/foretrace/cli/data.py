@@ -59,7 +59,13 @@ def _print_description(description: dict) -> None:
             print(f"{name.replace('_', ' '):>42} {value:10.4g}")
 
 
-def show(path: Positional[Path], id: int | None = None, out: Path | None = None) -> None:
+def show(
+    path: Positional[Path],
+    id: int | None = None,
+    out: Path | None = None,
+    arm: bool = False,
+    run: Path | None = None,
+) -> None:
     """Draw a contact sheet of a data set, or one interaction as a picture and an animation.
 
     Args:
@@ -67,7 +73,12 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
         id: Number of the interaction to draw; without it, the contact sheet is drawn.
         out: File to write: .png, .svg or .pdf; with an id also .gif or .mp4. By default pictures go to the
             data set's folder figures.
+        arm: Render the lever-up of --id in three dimensions, with the whole arm. Needs foretrace[sim].
+        run: Folder of a training, whose predictor's most probable path and region are drawn too; with --arm only.
     """
+    if arm or run is not None:
+        _show_arm(path, id, out, arm, run)
+        return
     from foretrace.pictures.animation import interaction_animation
     from foretrace.pictures.contact_sheet import contact_sheet
     from foretrace.pictures.scene import interaction_figure
@@ -91,3 +102,21 @@ def show(path: Positional[Path], id: int | None = None, out: Path | None = None)
             figure = contact_sheet(dataset) if id is None else interaction_figure(dataset.with_id(id))
             figure.savefig(target)
         print(target)
+
+
+def _show_arm(path: Path, id: int | None, out: Path | None, arm: bool, run: Path | None) -> None:
+    """Render one lever-up with the arm."""
+    if not arm:
+        raise DatasetError(f"--run {run} goes with --arm: add it, or compare with `foretrace predict --data`")
+    if id is None:
+        raise DatasetError("--arm renders one lever-up: choose it with --id")
+    from foretrace.pictures.rendered import rendered_animation
+
+    dataset = Dataset.open(path)
+    interaction, imagined = dataset.with_id(id), None
+    if run is not None:
+        from foretrace.export.episodes import choose
+
+        imagined = choose(path, [id], run)[0].imagined
+    target = path / "figures" / f"interaction-{id}-arm.gif" if out is None else out
+    print(rendered_animation(interaction, target, imagined))

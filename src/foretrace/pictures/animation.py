@@ -74,13 +74,26 @@ def interaction_animation(
 
 def scene_animation(scene: Scene, path: str | Path) -> Path:
     """The animation of `interaction_animation` for any scene."""
-    path = Path(path)
+    period = float(np.median(np.diff(scene.times))) if len(scene.times) > 1 else 0.05
+    return write_animation(Path(path), frames(scene), period)
+
+
+def write_animation(path: Path, pictures: Iterator[np.ndarray], period: float) -> Path:
+    """Write pictures (rows, columns, 3), uint8, as a GIF or MP4.
+
+    Args:
+        path: The file to write; its ending decides between ``.gif`` and ``.mp4``.
+        pictures: The pictures in order.
+        period: Time between them [s].
+
+    Raises:
+        PredictionError: The ending is unknown, or MP4 cannot be written here.
+    """
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
     if path.suffix.lower() not in writers:
         raise PredictionError(f"cannot write an animation to {path}: choose a name ending in .gif or .mp4")
-    period = float(np.median(np.diff(scene.times))) if len(scene.times) > 1 else 0.05
     path.parent.mkdir(parents=True, exist_ok=True)
-    writers[path.suffix.lower()](path, frames(scene), period)
+    writers[path.suffix.lower()](path, pictures, period)
     return path
 
 
