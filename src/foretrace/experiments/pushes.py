@@ -18,7 +18,14 @@ from scipy.spatial import KDTree
 from foretrace.errors import ResultsError, is_whole, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
 from foretrace.experiments import SUMMARIES
-from foretrace.experiments.pushes_report import draw_coverage, draw_errors, draw_poses, report_of, summary_of
+from foretrace.experiments.pushes_report import (
+    draw_coverage,
+    draw_errors,
+    draw_poses,
+    report_of,
+    summary_of,
+    worst_of,
+)
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix, rotate_plane
 from foretrace.interactions.pushes import ROD_RADIUS, RecordedPushes, read_pushes
@@ -157,7 +164,7 @@ class PushesExperiment(Experiment):
             "rows_left_out": self._read[1],
             "repetitions": repetitions(self._read[0]),
         }
-        return about | {"methods": summary_of(rows)}
+        return about | {"methods": summary_of(rows), "worst": worst_of(rows)}
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """A table of all methods, and one by shape."""

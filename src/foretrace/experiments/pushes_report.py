@@ -39,11 +39,25 @@ MANY = 30
 """Fewer pairs of repeated pushes tell nothing of the least error."""
 WORST, TYPICAL = 4, 8
 """Pushes that are drawn."""
+MANY_WORST = 20
+"""Pushes that are listed."""
 
 
 def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Errors and coverage of each method."""
     return {str(method): _numbers(part) for method, part in rows.groupby("method", sort=False)}
+
+
+def worst_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """The pushes that `SHOWN` errs most on, and what every method makes of them [mm]."""
+    errors = rows.pivot_table(index=["line", "shape"], columns="method", values="position_mm", sort=False)
+    if SHOWN not in errors:
+        return []
+    worst = errors.nlargest(MANY_WORST, SHOWN)
+    return [
+        {"line": int(line), "shape": str(shape), "position_mm": {str(k): float(v) for k, v in each.items()}}
+        for (line, shape), each in worst.iterrows()  # pyright: ignore[reportGeneralTypeIssues]
+    ]
 
 
 def _numbers(part: pd.DataFrame) -> dict[str, Any]:
@@ -130,6 +144,18 @@ def report_of(summary: Mapping[str, Any]) -> str:
         for name, each in methods.items()
     ]
     text += ["\n## By shape\n", "Position [mm] / rotation [°].\n", markdown_table(["Method", *shapes], parts)]
+    if worst := summary["worst"]:
+        columns = list(worst[0]["position_mm"])
+        listed = [
+            [str(each["line"]), each["shape"], *(f"{each['position_mm'][name]:.1f}" for name in columns)]
+            for each in worst
+        ]
+        mean = [f"{np.mean([each['position_mm'][name] for each in worst]):.1f}" for name in columns]
+        words = (
+            f"Position errors [mm] of every method where the {WORDS[SHOWN]} errs most; line of the file.\n"
+        )
+        table = markdown_table(["Line", "Shape", *columns], [*listed, ["mean", "", *mean]])
+        text += [f"\n## The worst {len(worst)}\n", words, table]
     if summary["rows_left_out"]:
         text += ["\n## Rows that were left out\n", *(f"- {each}" for each in summary["rows_left_out"])]
     return "\n".join(text) + "\n"
