@@ -28,6 +28,7 @@ EVERY = {
     "turn-over": goals.TurnOver(edge=1),
     "move": goals.Move((1.0, 0.5)),
     "move-to": goals.MoveTo((0.05, 0.02), turn=0.1),
+    "turn": goals.Turn(0.4),
     "slide-off": goals.SlideOff((0.1, 0.0), (1.0, 0.0)),
     "avoid": goals.Avoid(ZONE),
     "keep-upright": goals.KeepUpright(),
@@ -124,6 +125,7 @@ def test_goal_moves_with_the_object(label):
     other = {
         "move": goals.Move(turn @ [1.0, 0.5]),
         "move-to": goals.MoveTo(turn @ [0.05, 0.02] + shift, turn=0.1),
+        "turn": goals.Turn(0.4),
         "slide-off": goals.SlideOff(turn @ [0.1, 0.0] + shift, turn @ [1.0, 0.0]),
         "avoid": goals.Avoid(np.array(ZONE) @ turn.T + shift),
     }.get(label, EVERY[label])
@@ -241,7 +243,7 @@ def test_kept_constraints_come_before_costs():
 def test_contacts_go_round_the_outline_and_look_inwards():
     rim = Rim(PRISM.corners)
     along = np.linspace(0, 2 * rim.length, 200)
-    found = place(rim, along, np.zeros(200), [ft.ToolPath()] * 200)
+    found = place(ft.LeverUp, rim, along, np.zeros(200), [ft.ToolPath()] * 200)
     for action in found.actions:
         action.check_contact(PRISM)
         nearest = ft.LeverUp.nearest(PRISM, action.contact)
@@ -263,14 +265,14 @@ def test_no_blade_gets_into_a_narrow_dent():
     dented = ft.Prism([*half, *((-x, y) for x, y in half[::-1])])
     scene, rim = Scene.of(dented), Rim(dented.corners)
     along = np.linspace(0, rim.length, 150)
-    found = place(rim, along, np.zeros(150), [ft.ToolPath()] * 150)
+    found = place(ft.LeverUp, rim, along, np.zeros(150), [ft.ToolPath()] * 150)
     free, lost = find_free(scene, found)
     x, y = found.contacts.T
     inside = (np.abs(x) < 0.004) & (y > -0.05) & (y < 0.075)
     assert inside.any()
     assert not free[inside].any()
     assert free[~inside].mean() > 0.9
-    assert lost["no blade gets there"] >= inside.sum()
+    assert lost["no tool gets there"] >= inside.sum()
 
 
 def test_view_and_object_have_the_same_candidates():
@@ -294,7 +296,7 @@ def test_plan_takes_the_contact_with_the_longest_lever_that_does_not_slip():
     assert found.risk <= 0.05
     assert found.cost == pytest.approx(-(1 - found.risk) * 3 * ahead, abs=1e-3)
     rim = Rim(PRISM.corners)
-    every = place(rim, np.linspace(0, rim.length, 2000), np.zeros(2000), [ft.ToolPath()] * 2000)
+    every = place(ft.LeverUp, rim, np.linspace(0, rim.length, 2000), np.zeros(2000), [ft.ToolPath()] * 2000)
     fine = [
         (com - each.contact) @ each.direction
         for each in every.actions
@@ -523,7 +525,7 @@ goal 'lift': give a goal such as ft.goals.Lift(), or a function of motions
 what is planned for of type list: give ObjectModel or TopDownView
 imaginer of type str: give an imaginer, such as a predictor
 config of type int: give PlanConfig
-reach is 3: give a function of a lever-up, or None
+reach is 3: give a function of an action, or None
 T_table_object must be numbers in the shape (4, 4), not in the shape (2,)
 max_slip is 'no': give a probability, 0 to 1
 chance is None: give a probability, 0 to 1

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from foretrace.simulation.collect import CollectConfig, collect
     from foretrace.simulation.lever_up import SimulationConfig, replay, simulate, simulate_lever_up
     from foretrace.twin import TwinConfig, TwinImaginer
+    from foretrace.twin.sliding import SlidingTwin
 
 __version__ = "0.1.0"
 
@@ -71,6 +72,7 @@ _HOMES = {
     "foretrace.simulation.collect": ("CollectConfig", "collect"),
     "foretrace.simulation.lever_up": ("SimulationConfig", "replay", "simulate", "simulate_lever_up"),
     "foretrace.twin": ("TwinConfig", "TwinImaginer"),
+    "foretrace.twin.sliding": ("SlidingTwin",),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -105,6 +107,7 @@ __all__ = [
     "Push",
     "PushPath",
     "SimulationConfig",
+    "SlidingTwin",
     "ToolPath",
     "TopDownView",
     "TrainConfig",

@@ -27,6 +27,8 @@ FARTHEST = 100.0
 """A contact with a larger coordinate is a mistake, such as one in other units [m]."""
 SHORTEST, LONGEST = 1e-9, 1e9
 """Bounds of a given direction's length, which does not matter otherwise."""
+SETTLE_TIME = 0.3
+"""Time in which an object comes to rest after an action [s]."""
 UNIT_TOLERANCE = 1e-9
 """A stored direction differs from unit length by less than this."""
 
@@ -50,6 +52,16 @@ class Action(ABC):
     """Name in records and messages."""
     outcomes: ClassVar[tuple[str, ...]]
     """What its judge can conclude; beside them, every action can have `FAILED`."""
+    approach: ClassVar[tuple[float, float, float]] = (0.0035, 0.002, 0.3)
+    """Free space that the tool takes before a contact: half its width, its nearest and its farthest end [m]."""
+    cone: ClassVar[float] = 0.2
+    """Largest angle between direction and inward normal that a planner tries by default [rad]."""
+    varied: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Parameters of the path that a planner may vary, with their ranges [SI]."""
+    path_matters: ClassVar[bool] = False
+    """Whether a planner varies the path by default."""
+    sets_down: ClassVar[bool] = False
+    """Whether the object comes to rest only when the tool goes back the way it came."""
 
     contact: Annotated[Any, Float[np.ndarray, "2"]]
     """Point of the outline where the tool meets it, in the object frame [m]."""
@@ -111,6 +123,18 @@ class Action(ABC):
             Position [m] and rotation vector [rad]; the tool turns about one axis of the action frame at most.
         """
 
+    def motion_to_rest(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 6"]:
+        """As `tool_motion`, but the tool then goes back the way it came, where that `sets_down` the object."""
+        if not self.sets_down:
+            return self.tool_motion(times)
+        times = np.asarray(times, dtype=float)
+        return self.tool_motion(np.where(times <= self.duration, times, 2 * self.duration - times))
+
+    @property
+    def time_to_rest(self) -> float:
+        """Time until the object has come to rest, the tool back where it began if it `sets_down` [s]."""
+        return (2 if self.sets_down else 1) * self.duration + SETTLE_TIME
+
     @abstractmethod
     def judge(self, motion: Motion, obj: ObjectModel, com: Float[np.ndarray, "time 3"]) -> Judgement:
         """What became of the object.
@@ -128,7 +152,25 @@ class Action(ABC):
     @classmethod
     def nominal_parameters(cls) -> dict[str, float]:
         """Parameters of the default path."""
-        return cls((0.0, 0.0), (1.0, 0.0)).parameters()  # pyright: ignore[reportCallIssue]
+        return cls.nominal().parameters()
+
+    @classmethod
+    def nominal(cls: type[Placed]) -> Placed:
+        """The action on its default path, at the origin along x."""
+        return cls((0.0, 0.0), (1.0, 0.0))  # pyright: ignore[reportCallIssue]
+
+    @classmethod
+    def path_of(cls, **parameters: float) -> Any:
+        """The default path with other parameters.
+
+        Raises:
+            ActionError: One of them is out of its range.
+        """
+        return replace(cls.nominal().path, **parameters)
+
+    def settings(self) -> dict[str, float]:
+        """All that decides the path, by name: its `parameters`, and its other values."""
+        return vars(self.path) | self.parameters()
 
     @classmethod
     def at_edge(

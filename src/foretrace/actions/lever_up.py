@@ -152,6 +152,9 @@ class LeverUp(Action):
 
     label = "lever-up"
     outcomes = tuple(str(outcome) for outcome in Outcome if outcome != FAILED)
+    approach = APPROACH
+    varied = VARIED_ACTION
+    sets_down = True
     path: ToolPath = ToolPath()
     """Path of the blade's tip."""
     tool: Screwdriver = SCREWDRIVER
@@ -175,6 +178,19 @@ class LeverUp(Action):
     def parameters(self) -> dict[str, float]:
         """``insertion``, ``arc_radius``, ``sweep`` and ``speed`` of the path [SI] (paper, section 6)."""
         return self.path.parameters()
+
+    @classmethod
+    def path_of(cls, **parameters: float) -> ToolPath:
+        """The nominal path with other parameters."""
+        return ToolPath.of(**parameters)
+
+    def settings(self) -> dict[str, float]:
+        """Parameters and other values of the path; times that the speed scales are those at the nominal speed."""
+        parameters = self.parameters()
+        scaled = {
+            name: getattr(self.path, name) * parameters["speed"] for name in ("insert_time", "lift_time")
+        }
+        return vars(self.path) | scaled | parameters
 
 
 def sample_contacts(obj: ObjectModel, rng: np.random.Generator, per_edge: int = 2) -> list[LeverUp]:

@@ -2,6 +2,8 @@
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import shapely
@@ -40,6 +42,16 @@ class PushOutcome(StrEnum):
     """Not moved."""
     FAILED = FAILED
     """The simulation diverged; there is no effect to learn from."""
+
+
+PUSHED, TURNED_AWAY, MISSED = (
+    str(each) for each in (PushOutcome.PUSHED, PushOutcome.TURNED_AWAY, PushOutcome.MISSED)
+)
+
+
+def find_missed(shift: Any, turn: Any) -> Any:
+    """Whether objects that moved [m] and turned [rad] by so much have been missed."""
+    return (shift < MOVED) & (np.abs(turn) < TURNED)
 
 
 @dataclass(frozen=True)
@@ -111,6 +123,10 @@ class Push(Action):
 
     label = "push"
     outcomes = tuple(str(outcome) for outcome in PushOutcome if outcome != FAILED)
+    approach = (ROD.radius, PushPath.approach, PushPath.approach + 2 * ROD.radius)
+    cone = 0.7
+    varied = MappingProxyType({"distance": (0.002, 0.1)})
+    path_matters = True
     path: PushPath = PushPath()
     """Path of the rod."""
     tool: Rod = ROD
@@ -135,7 +151,7 @@ class Push(Action):
             return Judgement(PushOutcome.TIPPED)
         turn = rotation[0].T @ rotation[-1]
         shift = np.linalg.norm(com[-1, :2] - com[0, :2])
-        if shift < MOVED and abs(np.arctan2(turn[1, 0], turn[0, 0])) < TURNED:
+        if find_missed(shift, np.arctan2(turn[1, 0], turn[0, 0])):
             return Judgement(PushOutcome.MISSED)
         outline = obj.corners @ rotation[-1, :2, :2].T + motion.object_pose[-1, :2]
         gap = (

@@ -15,7 +15,7 @@ from foretrace.errors import ForetraceError, PredictionError
 from foretrace.imagined.shown import LEVEL
 
 if TYPE_CHECKING:
-    from foretrace.actions import LeverUp, ToolPath
+    from foretrace.actions import Action, ToolPath
     from foretrace.imagined import ImaginedBatch, Imaginer
     from foretrace.interactions.topdown import TopDownView
 
@@ -149,25 +149,25 @@ def _view_of(mask: np.ndarray, given: ObjectOptions, scene: Any) -> "TopDownView
     return TopDownView.from_mask(mask, given.scale or 1.0, -turn.T @ shift, turn[0], scene.height)
 
 
-def _around(scene: Any, number: int) -> "list[LeverUp]":
+def _around(scene: Any, number: int) -> "list[Action]":
     """Lever-ups along the inward normals at evenly spaced points of the outline that a blade gets to.
 
     Raises:
         PredictionError: There is none.
     """
-    from foretrace.actions import ToolPath
+    from foretrace.actions import LeverUp, ToolPath
     from foretrace.planning.candidates import Rim, find_free, place
 
     rim = Rim(scene.outline)
     along = (np.arange(number) + 0.5) * rim.length / number
-    found = place(rim, along, np.zeros(number), [ToolPath()] * number)
+    found = place(LeverUp, rim, along, np.zeros(number), [ToolPath()] * number)
     free, lost = find_free(scene, found)
     if not free.any():
         raise PredictionError(f"no contact can be used ({', '.join(lost)}): give --edge or --contact")
     return list(found[np.flatnonzero(free)].actions)
 
 
-def _row(name: str, action: "LeverUp", imagined: "ImaginedBatch", k: int) -> Row:
+def _row(name: str, action: "Action", imagined: "ImaginedBatch", k: int) -> Row:
     """A row of the table: where the most probable motion has led at the end of the action."""
     from foretrace.geometry import quaternion_to_matrix, tilt
 

@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from foretrace.perception.photo import PhotoView
     from foretrace.planning import Plan
 
-GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "slide-off"]
+GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "turn", "slide-off"]
 BELONGS: dict[str, tuple[GoalName, ...]] = {
     "max_slip": ("lift", "tilt", "move"),
     "at_least": ("lift", "move"),
-    "angle": ("tilt",),
+    "angle": ("tilt", "turn"),
     "edge": ("turn-over",),
     "direction": ("turn-over", "move"),
     "position": ("move-to",),
     "turn": ("move-to",),
-    "tolerance": ("tilt", "move-to"),
+    "tolerance": ("tilt", "move-to", "turn"),
     "point": ("slide-off",),
     "outward": ("slide-off",),
 }
@@ -40,6 +40,7 @@ NEEDED: dict[GoalName, tuple[str, ...]] = {
     "tilt": ("angle",),
     "move": ("direction",),
     "move-to": ("position",),
+    "turn": ("angle",),
     "slide-off": ("point", "outward"),
 }
 """Options that a goal cannot do without."""
@@ -56,7 +57,7 @@ class GoalOptions:
     at_least: float | None = None
     """Rise or distance from which on the goal counts as reached [m]; 0.01 by default."""
     angle: float | None = None
-    """Angle to tilt to [rad]."""
+    """Angle to tilt to, or to turn by about the vertical [rad]."""
     edge: int | None = None
     """Edge of the outline to turn over; edge k runs from corner k to corner k + 1."""
     direction: tuple[float, float] | None = None
@@ -66,7 +67,7 @@ class GoalOptions:
     turn: float | None = None
     """Turn about the vertical that the object shall have at the end [rad]."""
     tolerance: float | None = None
-    """Deviation up to which the goal counts as reached [m, or rad for tilt]."""
+    """Deviation up to which the goal counts as reached [m, or rad for tilt and turn]."""
     point: tuple[float, float] | None = None
     """A point of the table's edge, X Y [m]."""
     outward: tuple[float, float] | None = None

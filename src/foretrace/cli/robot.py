@@ -178,7 +178,12 @@ def _action(
     if plan is not None:
         if contact is not None or direction is not None or path != ToolPath():
             raise RobotError(f"{plan} says where and how: leave out --contact, --direction and the path")
-        return Plan.open(plan).table_action
+        found = Plan.open(plan).table_action
+        if not isinstance(found, LeverUp):
+            raise RobotError(
+                f"{plan} plans a {found.label}: the arm moves a blade, give a plan of a lever-up"
+            )
+        return found
     if contact is None or direction is None:
         raise RobotError("give a plan.json of `foretrace plan`, or --contact X Y and --direction X Y")
     return LeverUp(contact, direction, path)

@@ -17,7 +17,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from foretrace.actions import FAILED, LeverUp, ToolPath
+from foretrace.actions import FAILED, Action, LeverUp, ToolPath
 from foretrace.errors import ForetraceError, ResultsError
 from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
 from foretrace.experiments import SUMMARIES
@@ -208,7 +208,7 @@ class Planning(Experiment):
                 continue
             rim = Rim(scene.outline)
             along = (np.arange(self.contacts) + 0.5) * rim.length / self.contacts
-            pool = place(rim, along, np.zeros(self.contacts), [ToolPath()] * self.contacts)
+            pool = place(LeverUp, rim, along, np.zeros(self.contacts), [ToolPath()] * self.contacts)
             pool = pool[np.flatnonzero(find_free(scene, pool)[0])]
             if len(pool) >= LEAST_FREE:
                 return Case(obj, camera, scene, pool.actions, physics, self.seed)
@@ -245,7 +245,7 @@ class Case:
     obj: ObjectModel
     camera: LeverUp
     scene: Scene
-    actions: tuple[LeverUp, ...]
+    actions: tuple[Action, ...]
     physics: Physics
     seed: int
 
@@ -317,7 +317,7 @@ class Remembered(Imaginer):
         return self.imaginer.imagine_scenes(scenes)
 
 
-def _as_motions(played: Sequence[Interaction], actions: Sequence[LeverUp], scene: Scene) -> Motions:
+def _as_motions(played: Sequence[Interaction], actions: Sequence[Action], scene: Scene) -> Motions:
     """Simulated effects as futures that are certain; one that diverged stays where it was, and has failed."""
     times = max((each.effect.times for each in played), key=len)
     com, turned = np.zeros((len(played), len(times), 3)), np.zeros((len(played), len(times), 3))

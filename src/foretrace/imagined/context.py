@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import Action, LeverUp
+from foretrace.actions import ACTIONS, Action
 from foretrace.errors import PredictionError, TrainingError, shown
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -36,8 +36,6 @@ PARAMETERS = {
 """Parameters of the action's path by name."""
 CONTEXT = CONSTANTS | PARAMETERS
 """Everything that a predictor may be conditioned on."""
-TIMED = ("insert_time", "lift_time")
-"""Times of a path that its parameter ``speed`` scales."""
 SAME = 1e-9
 """Values of a parameter that differ by less are the same."""
 
@@ -58,10 +56,16 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
+def first_action(outcomes: Sequence[str] = ()) -> type[Action]:
+    """The first registered action that can have these outcomes; without any, or if none can, the first of all."""
+    kinds = list(ACTIONS.values())
+    return next((kind for kind in kinds if set(outcomes) <= set(kind.outcomes)), kinds[0])
+
+
 @cache
-def nominal_parameters() -> Mapping[str, float]:
-    """Parameters and further settings of the nominal path."""
-    return _settings(LeverUp((0.0, 0.0), (1.0, 0.0)))
+def nominal_parameters(kind: type[Action] | None = None) -> Mapping[str, float]:
+    """Parameters and further settings of an action's nominal path, by default of the first action's."""
+    return MappingProxyType((kind or first_action()).nominal().settings())
 
 
 def parameters_of(actions: Sequence[Action]) -> dict[str, Float[np.ndarray, " n"]]:
@@ -71,21 +75,10 @@ def parameters_of(actions: Sequence[Action]) -> dict[str, Float[np.ndarray, " n"
     for action in actions:
         key = type(action), action.path
         if key not in kinds:
-            kinds[key] = _settings(action)
+            kinds[key] = action.settings()
         found.append(kinds[key])
     names = dict.fromkeys(name for settings in kinds.values() for name in settings)
     return {name: np.array([settings.get(name, np.nan) for settings in found]) for name in names}
-
-
-def _settings(action: Action) -> Mapping[str, float]:
-    """Parameters of an action's path, and its other settings; times that the speed scales, at the nominal speed."""
-    parameters = action.parameters()
-    further = {
-        name: value * parameters.get("speed", 1.0) if name in TIMED else value
-        for name, value in vars(action.path).items()
-        if name not in parameters
-    }
-    return MappingProxyType(parameters | further)
 
 
 def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
@@ -144,6 +137,9 @@ def given_context(
     parameters: Mapping[str, Float[np.ndarray, " n"]],
     number: int = 1,
     optional: bool = False,
+    *,
+    kind: type[Action] | None = None,
+    usual: Mapping[str, float] | None = None,
 ) -> Float[np.ndarray, "n context"]:
     """Context of actions, in SI units; NaN where a constant is not told.
 
@@ -154,26 +150,31 @@ def given_context(
             may add to them.
         number: Number of actions.
         optional: Whether the imaginer can do without constants.
+        kind: The kind of action; by default the first one.
+        usual: Constants that a context of None tells; by default the nominal ones.
 
     Raises:
         PredictionError: A value is missing, is no finite number, contradicts an action's path, or is none that the
             imaginer is conditioned on.
     """
-    told = _told(names, context, optional)
+    nominal = nominal_parameters(kind)
+    told = _told(names, context, optional, nominal_constants() if usual is None else usual)
     for name, value in told.items():
         for planned in parameters.get(name, ()):
-            if abs(planned - nominal_parameters()[name]) > SAME < abs(planned - value):
+            if abs(planned - nominal[name]) > SAME < abs(planned - value):
                 raise PredictionError(
                     f"context {name} is {value}, the action's path has {planned}: give one of the two"
                 )
-    usual = dict(parameters) if parameters else dict(nominal_parameters())
+    planned = dict(parameters) if parameters else dict(nominal)
     found = np.full((number, len(names)), np.nan)
     for k, name in enumerate(names):
-        found[:, k] = told.get(name, usual.get(name, np.nan))
+        found[:, k] = told.get(name, planned.get(name, np.nan))
     return found
 
 
-def _told(names: Sequence[str], context: Context, optional: bool) -> dict[str, float]:
+def _told(
+    names: Sequence[str], context: Context, optional: bool, usual: Mapping[str, float]
+) -> dict[str, float]:
     """Values that are told, by name.
 
     Raises:
@@ -181,7 +182,7 @@ def _told(names: Sequence[str], context: Context, optional: bool) -> dict[str, f
     """
     constants = [name for name in names if name in CONSTANTS]
     if context is None:
-        return {name: nominal_constants()[name] for name in constants}
+        return {name: usual[name] for name in constants}
     if isinstance(context, str) and context == UNKNOWN:
         context = {}
     elif not isinstance(context, Mapping):
@@ -202,7 +203,9 @@ def _told(names: Sequence[str], context: Context, optional: bool) -> dict[str, f
         )
     for name, value in context.items():
         if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
-            raise PredictionError(f"context {name} is {shown(value)}: give a finite value {CONTEXT[name]}")
+            raise PredictionError(
+                f"context {name} is {shown(value)}: give a finite value {CONTEXT.get(name, 'in m')}"
+            )
     if context.get(EXACT, 0) != 0:
         raise PredictionError(
             f"context {EXACT} is {shown(context[EXACT])}: give 0 for a contact as commanded, or leave it out"
@@ -211,18 +214,21 @@ def _told(names: Sequence[str], context: Context, optional: bool) -> dict[str, f
 
 
 def find_unconditioned(
-    parameters: Mapping[str, Float[np.ndarray, " batch"]], names: Sequence[str]
+    parameters: Mapping[str, Float[np.ndarray, " batch"]],
+    names: Sequence[str],
+    kind: type[Action] | None = None,
 ) -> tuple[tuple[str, ...], ...]:
     """Warnings about paths that differ from the nominal one in what a predictor is not conditioned on.
 
     Args:
         parameters: Values of each parameter; NaN: unknown.
         names: The variables that the predictor is conditioned on.
+        kind: The kind of action; by default the first one.
 
     Returns:
         The lines of each action.
     """
-    nominal, number = nominal_parameters(), len(next(iter(parameters.values())))
+    nominal, number = nominal_parameters(kind), len(next(iter(parameters.values())))
     warnings: list[list[str]] = [[] for _ in range(number)]
     for name, values in parameters.items():
         if name in names or name not in nominal:

@@ -1,7 +1,7 @@
 """The contract of everything that imagines effects: one door with the same checks, warnings and shapes."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,18 +10,19 @@ from typing import ClassVar, Literal, final
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import Action, LeverUp
+from foretrace.actions import Action
 from foretrace.errors import PredictionError, check_type, shown
 from foretrace.geometry import Numbers, finite_array, rotation_vector_to_quaternion
 from foretrace.imagined.belief import Belief
 from foretrace.imagined.context import (
     CONSTANTS,
-    PARAMETERS,
     UNKNOWN,
     Context,
     column_of,
     find_unconditioned,
+    first_action,
     given_context,
+    nominal_constants,
     parameters_of,
     recorded_context,
 )
@@ -72,6 +73,8 @@ class Scenes:
     observed: Float[np.ndarray, "batch samples 6"] | None = None
     """Motions' first samples at the imaginer's sample times, where they are under way: centre of mass in the action
     frame [m] and rotation vector since rest [rad]."""
+    actions: tuple[Action, ...] | None = None
+    """The actions, where they are known; of a recorded one, the parameters of its path alone are."""
 
     def __len__(self) -> int:
         return len(self.com)
@@ -99,6 +102,8 @@ class Imaginer(ABC):
     """Variables that it is conditioned on beside the view: names of `foretrace.imagined.context.CONTEXT`."""
     marginal: bool = False
     """Whether it can do without constants of its context: its futures then cover what is not told."""
+    rests: bool = False
+    """Whether imagined motions end with the object at rest and the tool gone, as a sequence of actions needs it."""
     observes: ClassVar[bool] = False
     """Whether it can be shown the first samples of a motion that is under way."""
 
@@ -121,6 +126,16 @@ class Imaginer(ABC):
     def learned_outcomes(self) -> tuple[str, ...]:
         """Outcomes of the motions that it imagines; of none, it imagines any action."""
         return ()
+
+    @property
+    def action(self) -> type[Action]:
+        """The kind of action that it imagines; by default the first one that can have its learned outcomes."""
+        return first_action(self.learned_outcomes)
+
+    @property
+    def nominal(self) -> Mapping[str, float]:
+        """Constants that it takes where no context is given."""
+        return nominal_constants()
 
     @property
     def needs_effect(self) -> str | None:
@@ -168,7 +183,7 @@ class Imaginer(ABC):
             self._check_action(action)
             parameters = parameters_of([action])
         belief = context if isinstance(context, Belief) else None
-        values = given_context(self.context, self._without(belief, context), parameters, 1, self.marginal)
+        values = self._told(self._without(belief, context), parameters, 1)
         batch = InteractionBatch.from_views([view])
         motion = None if observed is None else observed_motion(observed)
         if com is None and motion is not None and motion.com is not None:
@@ -182,7 +197,8 @@ class Imaginer(ABC):
             self._check_observes()
             seen = motion.states(self.sample_times, place)[None]
         start = "estimated" if com is None else "observed"
-        return self._answer(Scenes(batch, place[None], values, start, seen), parameters)[0]
+        known = None if action is None else (action,)
+        return self._answer(Scenes(batch, place[None], values, start, seen, known), parameters)[0]
 
     @final
     def imagine_batch(
@@ -219,8 +235,8 @@ class Imaginer(ABC):
         if context == "recorded":
             values = recorded_context(batch, self.context, self.marginal)
         else:
-            known = {name: column_of(batch, name) for name in PARAMETERS}
-            values = given_context(self.context, context, known, len(batch), self.marginal)
+            known = {name: column_of(batch, name) for name in self.action.nominal_parameters()}
+            values = self._told(context, known, len(batch))
         com = estimate_com(batch)
         if start == "observed":
             com = batch.com[:, 0] if batch.com.shape[1] else np.full_like(com, np.nan)
@@ -229,7 +245,7 @@ class Imaginer(ABC):
                     f"interaction {batch.ids[~there][0]} has no recorded centre of mass: take start='estimated'"
                 )
         seen = self._observe_batch(batch, int(observed)) if observed else None
-        parameters = {name: column_of(batch, name) for name in PARAMETERS}
+        parameters = {name: column_of(batch, name) for name in self.action.nominal_parameters()}
         return self._answer(Scenes(batch, com, values, start, seen), parameters)
 
     @final
@@ -272,15 +288,14 @@ class Imaginer(ABC):
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
         belief = context if isinstance(context, Belief) else None
-        values = given_context(
-            self.context, self._without(belief, context), parameters, len(actions), self.marginal
-        )
+        values = self._told(self._without(belief, context), parameters, len(actions))
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
         check_com(view, middle)
         if belief is not None:
             return self._average(view, actions, belief, candidates.enter(middle))
         start = "estimated" if com is None else "observed"
-        return self._answer(Scenes(candidates, candidates.enter(middle), values, start), parameters)
+        scenes = Scenes(candidates, candidates.enter(middle), values, start, actions=actions)
+        return self._answer(scenes, parameters)
 
     def _check_action(self, action: Action, who: str = "") -> None:
         """Refuse another kind of action than the one whose motions are imagined."""
@@ -291,6 +306,12 @@ class Imaginer(ABC):
                 "give the kind of action that it learned from, or another imaginer"
             )
 
+    def _told(self, context: Context, parameters: dict[str, np.ndarray], number: int) -> np.ndarray:
+        """Context of actions, see `given_context`."""
+        return given_context(
+            self.context, context, parameters, number, self.marginal, kind=self.action, usual=self.nominal
+        )
+
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
         return self._warned(self.imagine_scenes(scenes), scenes.context, parameters)
 
@@ -299,7 +320,9 @@ class Imaginer(ABC):
     ) -> ImaginedBatch:
         """Effects with warnings, also about paths that the imaginer is not conditioned on, and what it was told."""
         about_objects = imagined.warnings or ((),) * len(context)
-        about_paths = find_unconditioned(parameters, self.context) if parameters else ((),) * len(context)
+        about_paths = (
+            find_unconditioned(parameters, self.context, self.action) if parameters else ((),) * len(context)
+        )
         errors = imagined.futures.expected_error()
         unsure = [(UNSURE_OF.format(100 * error),) if error > UNSURE else () for error in errors]
         warnings = tuple(a + b + c for a, b, c in zip(about_objects, about_paths, unsure, strict=True))
@@ -321,7 +344,7 @@ class Imaginer(ABC):
                 "Monitor of the effect"
             )
         if action is None:
-            action = LeverUp((0.0, 0.0), (1.0, 0.0))
+            action = self.action.nominal()
         parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}
         values, causes = wrong_worlds(belief.sample(belief.worlds))
         played = play_worlds(self, view, action, com, values, parameters)
@@ -401,6 +424,7 @@ IMAGINERS: Registry[Callable[[ObjectModel | None], Imaginer]] = Registry(
 """What makes the imaginers that come ready for use, each by its label; told the object where it is known."""
 IMAGINERS.declare("learned", "foretrace.predictor")
 IMAGINERS.declare("twin", "foretrace.twin")
+IMAGINERS.declare("twin-to-rest", "foretrace.twin")
 
 
 @contextmanager

@@ -25,6 +25,8 @@ ROWS_AHEAD = 96
 """Rows of pixels ahead of the contact point; the rest lies behind it."""
 CONTACT_PIXEL = np.array([ROWS_AHEAD - 0.5, VIEW_SIZE / 2 - 0.5])
 """Row and column of the contact point, with pixel centres at whole numbers."""
+LOOK_AHEAD = (ROWS_AHEAD - VIEW_SIZE / 2) * METRES_PER_PIXEL
+"""The middle of a view lies this far ahead of its frame's origin [m]."""
 MINIMAL_HEIGHT = 0.004
 """Points of a cloud below this height belong to the table [m]."""
 
@@ -98,6 +100,18 @@ class TopDownView:
         height = np.zeros((VIEW_SIZE, VIEW_SIZE), dtype=np.float32)
         height[low[0] : high[0], low[1] : high[1]] = heights.reshape(centres.shape[:2])
         return cls(height > 0, height)
+
+    @classmethod
+    def around(cls, obj: ObjectModel) -> tuple["TopDownView", Float[np.ndarray, "4 4"]]:
+        """The exact view of a known object in the middle of the window, and the object's frame in that of the view.
+
+        Raises:
+            ViewError: The object does not fit into the window.
+        """
+        check_type("obj", obj, ObjectModel, ViewError)
+        middle = (obj.corners.min(axis=0) + obj.corners.max(axis=0)) / 2
+        camera = LeverUp(middle - np.array([LOOK_AHEAD, 0.0]), (1.0, 0.0))
+        return cls.of(obj, camera), camera.T_action_object
 
     @classmethod
     def from_mask(

@@ -26,6 +26,8 @@ ARROW = 0.05
 """Length of the arrow that shows the action [m]."""
 LEAST_PROBABLE = 0.02
 """Futures less probable than this are not drawn."""
+FLAT = 0.02
+"""A motion that never tilts by more than this stays flat [rad]."""
 RISKY = 0.2
 """Contacts whose risk is greater are crossed out."""
 
@@ -84,8 +86,9 @@ def draw_rim(axes: Axes, plan: Plan) -> None:
 
 
 def _draw_futures(height: Axes, angle: Axes, plan: Plan) -> None:
-    """Height of the centre of mass and tilt over time, as wide as they are probable."""
+    """Height of the centre of mass and tilt over time, or way and turn of what stays flat, as wide as probable."""
     futures, times = plan.futures, plan.imagined.times
+    flat = not (np.abs(futures.states[0, :, :, 3:5]) > FLAT).any()
     shown = times <= plan.action.duration + 1e-9
     for k in np.argsort(-futures.probability[0]):
         probability = float(futures.probability[0, k])
@@ -97,15 +100,15 @@ def _draw_futures(height: Axes, angle: Axes, plan: Plan) -> None:
             "linewidth": 0.8 + 1.8 * probability,
             "label": f"{name} {probability:.0%}",
         }
-        height.plot(times[shown], CM * states[:, 2], **look)
+        way = np.linalg.norm(states[:, :2] - states[0, :2], axis=1)
+        height.plot(times[shown], CM * (way if flat else states[:, 2]), **look)
         if np.isfinite(states[:, 3:]).all():
-            angle.plot(
-                times[shown], np.degrees(tilt(Rotation.from_rotvec(states[:, 3:]).as_matrix())), **look
-            )
-    height.set_ylabel("height of the\ncentre of mass [cm]")
+            turned = states[:, 5] if flat else tilt(Rotation.from_rotvec(states[:, 3:]).as_matrix())
+            angle.plot(times[shown], np.degrees(turned), **look)
+    height.set_ylabel(f"{'way' if flat else 'height'} of the\ncentre of mass [cm]")
     height.legend(loc="upper left", fontsize=8)
     height.tick_params(labelbottom=False)
-    angle.set_ylabel("tilt [degrees]")
+    angle.set_ylabel(f"{'turn' if flat else 'tilt'} [degrees]")
     angle.set_xlabel("time [s]")
     height.set_title("what is imagined of it")
 

@@ -8,5 +8,21 @@ from foretrace.planning.goals import Goal
 from foretrace.planning.motions import Motions
 from foretrace.planning.plan import PlanConfig, plan
 from foretrace.planning.result import Alternative, Plan, RimCost, Stage
+from foretrace.planning.sequence import Execution, Sequence, World, execute_sequence, plan_sequence
 
-__all__ = ["Alternative", "Goal", "Motions", "Plan", "PlanConfig", "RimCost", "Stage", "goals", "plan"]
+__all__ = [
+    "Alternative",
+    "Execution",
+    "Goal",
+    "Motions",
+    "Plan",
+    "PlanConfig",
+    "RimCost",
+    "Sequence",
+    "Stage",
+    "World",
+    "execute_sequence",
+    "goals",
+    "plan",
+    "plan_sequence",
+]

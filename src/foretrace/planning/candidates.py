@@ -1,26 +1,25 @@
-"""Candidates: lever-ups at contacts all around an outline, in directions near the inward normal."""
+"""Candidates: actions at contacts all around an outline, in directions near the inward normal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from foretrace.actions import Action, LeverUp, ToolPath
+from foretrace.actions import Action
 from foretrace.actions.base import CORNER_MARGIN
-from foretrace.actions.lever_up import APPROACH
 from foretrace.errors import PlanningError, check_type
 from foretrace.imagined.domain import check_object, find_usable_contacts
 from foretrace.interactions.outline import fit_outline
-from foretrace.interactions.topdown import METRES_PER_PIXEL, ROWS_AHEAD, VIEW_SIZE, TopDownView
+from foretrace.interactions.topdown import LOOK_AHEAD as LOOK_AHEAD
+from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 
-LOOK_AHEAD = (ROWS_AHEAD - VIEW_SIZE / 2) * METRES_PER_PIXEL
-"""The middle of a view lies this far ahead of its frame's origin [m]."""
-BLADE = APPROACH[0]
-"""Half the width of the space that the blade takes [m]: the normal of a curved outline is that of a chord as wide."""
+CHORD = 0.0035
+"""The normal of a curved outline is that of a chord which reaches this far to both sides [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +38,10 @@ class Scene:
     """Its centre of mass at rest in its own frame [m], where that is known."""
     object: ObjectModel | None = None
     """The object itself, where it is known."""
+    T_start_now: Float[np.ndarray, "4 4"] | None = None
+    """Its frame in that of the goal, where other actions have moved it since."""
+    com_start: Float[np.ndarray, "3"] | None = None
+    """Its centre of mass before these, in the frame of the goal [m]."""
 
     @classmethod
     def of(cls, seen: ObjectModel | TopDownView) -> "Scene":
@@ -56,13 +59,10 @@ class Scene:
             if len(outline) < 3:
                 raise PlanningError("the object in the view is too small to have an outline: move nearer")
             return cls(seen, np.eye(4), outline, float(seen.height.max()))
-        corners = seen.corners
-        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
-        action = LeverUp(middle - np.array([LOOK_AHEAD, 0.0]), (1.0, 0.0))
-        view = TopDownView.of(seen, action)
+        view, T_view_object = TopDownView.around(seen)
         check_object(view.mask, view.height)  # a needle is seen in no pixel
         com = seen.mass_properties(1.0).com
-        return cls(view, action.T_action_object, corners, seen.height, com, seen)
+        return cls(view, T_view_object, seen.corners, seen.height, com, seen)
 
     def in_view(self, actions: Sequence[Action]) -> list[Action]:
         """Actions in the object's frame, in that of the view."""
@@ -120,12 +120,12 @@ class Rim:
         return np.clip(along, low + margin, high - margin)
 
     def normals(self, along: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-        """Inward unit normals: of the edge, or, where it is shorter than the blade, of a chord as wide as that."""
+        """Inward unit normals: of the edge, or, where it is shorter, of a chord of twice `CHORD`."""
         edges = self.edge_at(along)
         low, high = self._starts[edges], self._starts[edges + 1]
-        short = high - low < 2 * BLADE
-        first = self.points(np.where(short, along - BLADE, low))
-        last = self.points(np.where(short, along + BLADE, high - 1e-9))
+        short = high - low < 2 * CHORD
+        first = self.points(np.where(short, along - CHORD, low))
+        last = self.points(np.where(short, along + CHORD, high - 1e-9))
         chord = last - first
         inward = np.stack([-chord[:, 1], chord[:, 0]], axis=1)
         return inward / np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
@@ -133,14 +133,14 @@ class Rim:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Lever-ups on one object, by where on the outline they act and how far they are turned from the normal."""
+    """Actions of one kind on one object, by where on the outline they act and their turn from the normal."""
 
     along: Float[np.ndarray, " n"]
     """Distance of the contact along the outline from its first corner [m]."""
     turn: Float[np.ndarray, " n"]
     """Angle of the direction to the left of the inward normal [rad]."""
-    actions: tuple[LeverUp, ...]
-    """The lever-ups, in the object's frame."""
+    actions: tuple[Action, ...]
+    """The actions, in the object's frame."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -164,12 +164,13 @@ class Candidates:
 
 
 def place(
+    kind: type[Action],
     rim: Rim,
     along: Float[np.ndarray, " n"],
     turn: Float[np.ndarray, " n"],
-    paths: Sequence[ToolPath],
+    paths: Sequence[Any],
 ) -> Candidates:
-    """Lever-ups at distances along an outline, turned from its normal [rad]."""
+    """Actions of a kind at distances along an outline, turned from its normal [rad]."""
     along = rim.off_corners(along)
     contacts, normals = rim.points(along), rim.normals(along)
     c, s = np.cos(turn), np.sin(turn)
@@ -177,19 +178,21 @@ def place(
         [c * normals[:, 0] - s * normals[:, 1], s * normals[:, 0] + c * normals[:, 1]], axis=1
     )
     actions = tuple(
-        LeverUp(contact, direction, path)
+        kind(contact, direction, path)  # pyright: ignore[reportCallIssue]
         for contact, direction, path in zip(contacts, directions, paths, strict=True)
     )
     return Candidates(along, turn, actions)
 
 
 def find_free(scene: Scene, candidates: Candidates) -> tuple[Bool[np.ndarray, " n"], dict[str, int]]:
-    """Which candidates a blade gets to straight from outside and an imaginer can look at, and why others fall out."""
+    """Which candidates a tool gets to straight from outside and an imaginer can look at, and why others fall out."""
+    if not len(candidates):
+        return np.zeros(0, dtype=bool), {}
     contacts = candidates.contacts
     directions = np.array([action.direction for action in candidates.actions]).reshape(-1, 2)
     outline = shapely.Polygon(scene.outline)
     shapely.prepare(outline)
-    side, near, far = APPROACH
+    side, near, far = candidates.actions[0].approach
     left = side * np.stack([-directions[:, 1], directions[:, 0]], axis=1)
     lost = -near * directions, -far * directions
     corners = np.stack(
@@ -201,14 +204,14 @@ def find_free(scene: Scene, candidates: Candidates) -> tuple[Bool[np.ndarray, " 
         ],
         axis=1,
     )
-    # At a turned blade one of its corners is nearer to the outline than its middle: this much is no obstacle.
+    # At a turned tool one of its corners is nearer to the outline than its middle: this much is no obstacle.
     slack = np.abs(np.sin(candidates.turn)) * side
     corners[:, :2] -= slack[:, None, None] * directions[:, None]
     free = ~shapely.intersects(outline, shapely.polygons(corners))
     turn, shift = scene.T_view_object[:2, :2], scene.T_view_object[:2, 3]
     seen = find_usable_contacts(scene.view.mask, contacts @ turn.T + shift, directions @ turn.T)
     reasons = {
-        "no blade gets there": int((~free).sum()),
+        "no tool gets there": int((~free).sum()),
         "the object reaches beyond the view": int((free & ~seen).sum()),
     }
     return free & seen, {reason: count for reason, count in reasons.items() if count}

@@ -1,8 +1,9 @@
 """What goals look at: imagined motions of many actions, in the object's own frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +15,8 @@ from foretrace.imagined import Futures, ImaginedBatch
 
 SAME_TIME = 1e-9
 """Times that differ by less are the same [s]."""
+FLAT = 0.1
+"""An object at rest that is tilted by less lies on the side on which it lay [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,7 @@ class Motions:
         actions: Sequence[Action],
         outline: Float[np.ndarray, "corners 2"],
         height: float,
+        whole: bool = False,
     ) -> "Motions":
         """Motions in the frame in which the actions are given.
 
@@ -55,8 +59,9 @@ class Motions:
             actions: The actions.
             outline: Outline of the object at rest in their frame [m].
             height: Its height [m].
+            whole: Motions count to the last imagined sample, not only until the path ends.
         """
-        ends = np.array([action.duration for action in actions])
+        ends = np.array([np.inf if whole else action.duration for action in actions])
         last = np.searchsorted(imagined.times, ends + SAME_TIME, side="right") - 1
         count = int(last.max()) + 1
         contacts = np.array([action.contact for action in actions])
@@ -73,6 +78,71 @@ class Motions:
 
     def __len__(self) -> int:
         return len(self.com)
+
+    def __getitem__(self, rows: np.ndarray) -> "Motions":
+        kept = {name: getattr(self, name)[rows] for name in ("com", "turned", "futures", "end")}
+        return replace(self, actions=tuple(self.actions[k] for k in np.arange(len(self))[rows]), **kept)
+
+    def thinned(self, count: int) -> "Motions":
+        """The same with a few samples, evenly from the start to the end of each; ``times`` are those of the longest."""
+        rows = np.rint(np.linspace(0, 1, count) * self.end[:, None]).astype(int)  # (batch, count)
+        at = np.arange(len(self))[:, None]
+        com, turned, states = (
+            np.moveaxis(each[at, :, rows], 1, 2) for each in (self.com, self.turned, self.futures.states)
+        )
+        spread = np.moveaxis(self.futures.spread[at, :, rows], 1, 2)
+        futures = replace(self.futures, states=states, spread=spread)
+        end = np.full(len(self), count - 1)
+        times = self.times[rows[int(self.end.argmax())]]
+        return replace(self, times=times, com=com, turned=turned, futures=futures, end=end)
+
+    def continuing(self, T_start_now: Float[np.ndarray, "4 4"], com: Float[np.ndarray, "3"]) -> "Motions":
+        """Motions that follow earlier ones, from the frame at the very start, with the rest there as first sample.
+
+        Args:
+            T_start_now: The object's frame now in its frame at the start.
+            com: Centre of mass at the start, in the latter [m].
+        """
+        turn = T_start_now[:3, :3]
+        moved, turned = self.com @ turn.T + T_start_now[:3, 3], self.turned
+        if abs(turn[2, 2] - 1) < 1e-9 and not np.abs(turned[..., :2]).max(initial=0.0) > 1e-9:
+            turned = turned + np.array([0.0, 0.0, np.arctan2(turn[1, 0], turn[0, 0])])
+        else:
+            from scipy.spatial.transform import Rotation
+
+            own = Rotation.from_rotvec(np.nan_to_num(turned).reshape(-1, 3))
+            turned = (Rotation.from_matrix(turn) * own).as_rotvec().reshape(turned.shape)
+        rest = np.broadcast_to(com, (*moved.shape[:2], 1, 3))
+        first = {"states": self.futures.states[:, :, :1], "spread": self.futures.spread[:, :, :1]}
+        grown = {
+            name: np.concatenate([each, getattr(self.futures, name)], axis=2) for name, each in first.items()
+        }
+        return Motions(
+            _Moved(self.actions, T_start_now),
+            np.concatenate([self.times[:1], self.times]),
+            np.concatenate([rest, moved], axis=2),
+            np.concatenate([np.zeros_like(rest), turned], axis=2),
+            replace(self.futures, **grown),
+            self.end + 1,
+            self.outline,
+            self.height,
+        )
+
+    def resting_frames(self) -> tuple[Float[np.ndarray, "batch 4 4"], Bool[np.ndarray, " batch"]]:
+        """The object's frame at the end of each likeliest motion, in its frame at rest; and whether it lies flat again.
+
+        What lies on another side keeps its frame as it turned.
+        """
+        rows, best = np.arange(len(self)), self.probability.argmax(axis=1)
+        frames = np.tile(np.eye(4), (len(self), 1, 1))
+        flat = self.at_end(self.tilt)[rows, best] < FLAT
+        angle = self.heading[rows, best]
+        frames[:, 0, 0] = frames[:, 1, 1] = np.cos(angle)
+        frames[:, 1, 0] = np.sin(angle)
+        frames[:, 0, 1] = -frames[:, 1, 0]
+        start, end = self.com[rows, best, 0], self.end_com[rows, best]
+        frames[:, :2, 3] = end[:, :2] - np.einsum("nij,nj->ni", frames[:, :2, :2], start[:, :2])
+        return frames, flat
 
     @property
     def outcome(self) -> np.ndarray:
@@ -165,3 +235,22 @@ class Motions:
         start = self.com[rows, futures, 0]
         arms = corners - start[:, None]  # (n, points, 3)
         return np.einsum("ntij,npj->ntpi", turns[:, :, :2], arms) + com[:, :, None, :2]
+
+
+class _Moved(Sequence[Action]):
+    """Actions as seen from another frame, each placed there when it is asked for."""
+
+    def __init__(self, actions: Sequence[Action], T: Float[np.ndarray, "4 4"]) -> None:
+        self._actions, self._T = actions, T
+
+    def __len__(self) -> int:
+        return len(self._actions)
+
+    def __getitem__(self, row: Any) -> Any:
+        return placed(self._actions[row], self._T)
+
+
+def placed(action: Action, T: Float[np.ndarray, "4 4"]) -> Action:
+    """An action of a frame in another one, by the first one's place in that, turned about the vertical."""
+    turn = T[:2, :2]
+    return replace(action, contact=turn @ action.contact + T[:2, 3], direction=turn @ action.direction)

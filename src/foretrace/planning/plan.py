@@ -1,4 +1,4 @@
-"""Choose where, which way and how an object is levered, by what is imagined of the candidates."""
+"""Choose where, which way and how a tool acts on an object, by what is imagined of the candidates."""
 
 import warnings
 from collections.abc import Callable
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action
 from foretrace.errors import PlanningError, check_choices, check_ranges, check_type, is_whole, shown
 from foretrace.extras import MissingExtraError
 from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined import IMAGINERS, Belief, Imaginer
-from foretrace.imagined.context import Context
+from foretrace.imagined.context import Context, first_action
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
@@ -23,8 +23,8 @@ from foretrace.planning.result import Plan
 from foretrace.planning.scores import Criterion
 from foretrace.planning.search import Search
 
-Reach = Callable[[LeverUp], str | None]
-"""Why the robot cannot carry out a lever-up in the object's frame; None: it can."""
+Reach = Callable[[Action], str | None]
+"""Why the robot cannot carry out an action in the object's frame; None: it can."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,13 @@ class PlanConfig:
 
     spacing: float = 0.005
     """Distance of contacts along the outline [m]; larger on an outline that would have more than 120."""
-    cone: float = 0.2
-    """Largest angle of a direction to the inward normal [rad]."""
+    cone: float | None = None
+    """Largest angle of a direction to the inward normal [rad]; by default the action's own: 0.2 for lever-ups, 0.7 for
+    pushes."""
     directions: int = 3
     """Directions at each contact, spread evenly over the cone; 1: the normal alone."""
-    vary_path: bool = False
-    """Vary the path's parameters that the imaginer is conditioned on, too."""
+    vary_path: bool | None = None
+    """Vary the path's parameters that the imaginer is conditioned on, too; by default of pushes alone."""
     refine: int = 2
     """Rounds in which the best candidates are improved by drawing others around them; 0 leaves this stage out."""
     samples: int = 64
@@ -63,7 +64,8 @@ class PlanConfig:
                 raise PlanningError(f"{name} is {shown(value)}: give a whole number from {least} to {most}")
         if not is_whole(self.seed, 0, 2**63 - 1):
             raise PlanningError(f"seed is {shown(self.seed)}: give a whole number from 0 to {2**63 - 1}")
-        limits = {"spacing": (0.001, 0.1), "cone": (0.0, 0.8), "tail": (0.001, 1.0)}
+        limits = {"spacing": (0.001, 0.1), "tail": (0.001, 1.0)}
+        limits |= {} if self.cone is None else {"cone": (0.0, 0.8)}
         check_ranges(PlanningError, "plan", self, limits)
         check_choices(PlanningError, self)
 
@@ -80,7 +82,7 @@ def plan(
     T_table_object: Float[np.ndarray, "4 4"] | None = None,
     reach: Reach | None = None,
 ) -> Plan:
-    """Choose the lever-up whose imagined outcome suits a goal best.
+    """Choose the action whose imagined outcome suits a goal best.
 
     Three stages: the imaginer looks at contacts all around the outline, and directions within a cone about the
     inward normal, in one batch; the best are refined by drawing others around them (iCEM: Pinneri et al., 2020); the
@@ -90,14 +92,15 @@ def plan(
         seen: The object, or a view of it from above. In a view, the object's frame is the view's.
         goal: What is to happen: one of `foretrace.planning.goals`, a sum of them, or a function of `Motions` that
             returns costs. Everything in it lies in the object's frame.
-        imaginer: Imagines the candidates; by default the predictor that comes with foretrace.
+        imaginer: Imagines the candidates, and says what kind of action they are; by default the predictor that comes
+            with foretrace, of lever-ups. `SlidingTwin` is one of pushes.
         context: What both imaginers are told, as of `Imaginer.imagine`.
-        checker: Checks the best candidates; by default the twin, which simulates them. Where simulation is not
+        checker: Checks the best candidates; by default the twin, which simulates lever-ups. Where simulation is not
             installed they are not checked, and a warning says so.
         config: How candidates are searched; stages can be left out.
         com: Centre of mass at rest in the object's frame [m]; by default the object's own, or estimated from the view.
         T_table_object: The object's pose in the table frame, if the plan is for a robot.
-        reach: Says why the robot cannot carry out a lever-up, or None.
+        reach: Says why the robot cannot carry out an action, or None.
 
     Returns:
         The plan: also where nothing reaches the goal, then with a `note`.
@@ -111,7 +114,7 @@ def plan(
     for name, value in (("imaginer", imaginer), ("checker", checker)):
         check_type(name, value, (Imaginer, type(None)), PlanningError, "an imaginer, such as a predictor")
     if reach is not None and not callable(reach):
-        raise PlanningError(f"reach is {shown(reach)}: give a function of a lever-up, or None")
+        raise PlanningError(f"reach is {shown(reach)}: give a function of an action, or None")
     if T_table_object is not None:
         T_table_object = finite_array("T_table_object", T_table_object, (4, 4), PlanningError)
     aim, scene = as_goal(goal), Scene.of(seen)
@@ -119,9 +122,14 @@ def plan(
     if com is not None:
         scene = scene.loaded(finite_array("com (x, y, z) [m]", com, (3,), PlanningError))
     own = _learned() if imaginer is None else imaginer
-    second = None
-    if config.check:
-        second = _twin(scene.object) if checker is None else checker
+    second = checker if config.check else None
+    if second is not None and second.action is not own.action:
+        raise PlanningError(
+            f"the {own.name} imagines a {own.action.label}, the checker {second.name} a {second.action.label}: give "
+            "two that imagine the same kind of action"
+        )
+    if config.check and checker is None and own.action is first_action():
+        second = _twin(scene.object)
     return Search(scene, aim, own, second, context, config, reach).run(T_table_object)
 
 

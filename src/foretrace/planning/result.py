@@ -1,14 +1,14 @@
 """What planning returns: the action, what is imagined of it, what else there was, and why that lost."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import Action, LeverUp
+from foretrace.actions import Action
 from foretrace.errors import ForetraceError, PlanningError
 from foretrace.files import as_path, read_versioned, write_json
 from foretrace.geometry import invert_transform
@@ -23,10 +23,10 @@ REMEDY = "give a file that plan.save or `foretrace plan` wrote"
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another lever-up that was imagined."""
+    """Another action that was imagined."""
 
-    action: LeverUp
-    """The lever-up, in the object's frame."""
+    action: Action
+    """The action, in the object's frame."""
     cost: float
     """Its cost."""
     risk: float
@@ -136,10 +136,10 @@ class _Plan(_Action):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The lever-up that was chosen. Plane vectors are in the object's frame; where a view was given, in the view's."""
+    """The action that was chosen. Plane vectors are in the object's frame; where a view was given, in the view's."""
 
-    action: LeverUp
-    """The lever-up, in the object's frame."""
+    action: Action
+    """The action, in the object's frame."""
     imagined: ImaginedEffect
     """What is imagined of it, in its action frame: by the checker, or else by the imaginer."""
     cost: float
@@ -184,8 +184,8 @@ class Plan:
         return self.T_table_object @ invert_transform(self.action.T_action_object)
 
     @property
-    def table_action(self) -> LeverUp:
-        """The lever-up in the table frame, as a robot takes it.
+    def table_action(self) -> Action:
+        """The action in the table frame, as a robot takes it.
 
         Raises:
             PlanningError: Where the object lies is not known.
@@ -195,14 +195,14 @@ class Plan:
                 "the plan does not know where the object lies on the table: plan from a photograph, or give "
                 "T_table_object"
             )
-        return LeverUp(T[:2, 3], T[:2, 0], self.action.path, self.action.tool)
+        return replace(self.action, contact=T[:2, 3], direction=T[:2, 0])
 
     def __repr__(self) -> str:
         x, y = 100 * self.action.contact
         note = f", {self.note}" if self.note else ""
         return (
-            f"Plan({self.goal}: lever at x {x:.1f}, y {y:.1f} cm, cost {self.cost:.3f}, risk {self.risk:.3f}, "
-            f"reached {self.reached:.3f}{note})"
+            f"Plan({self.goal}: {self.action.label} at x {x:.1f}, y {y:.1f} cm, cost {self.cost:.3f}, "
+            f"risk {self.risk:.3f}, reached {self.reached:.3f}{note})"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -310,10 +310,11 @@ def _from_content(content: _Plan) -> Plan:
     imagined = ImaginedEffect(times, futures.com[0, best], pose, futures, tuple(content["warnings"]), context)
     T, obj = content["T_table_object"], content["object"]
     return Plan(
-        action=_lever_up(content["action"]),
+        action=Action.from_dict(content["action"]),
         imagined=imagined,
         alternatives=tuple(
-            Alternative(**{**each, "action": _lever_up(each["action"])}) for each in content["alternatives"]
+            Alternative(**{**each, "action": Action.from_dict(each["action"])})
+            for each in content["alternatives"]
         ),
         rim=_rim(content["rim"]),
         stages=tuple(Stage(**{**each, "contact": np.array(each["contact"])}) for each in content["stages"]),
@@ -338,13 +339,6 @@ def _rim(content: _Rim) -> RimCost:
         _array("rim.cost", content["cost"], (count,)),
         _array("rim.risk", content["risk"], (count,)),
     )
-
-
-def _lever_up(content: Mapping[str, Any]) -> LeverUp:
-    action = Action.from_dict(content)
-    if not isinstance(action, LeverUp):
-        raise PlanningError(f"its action is a {action.label}, a lever-up is expected")
-    return action
 
 
 def _array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:

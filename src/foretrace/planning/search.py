@@ -4,13 +4,12 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from foretrace.actions import LeverUp, ToolPath
-from foretrace.actions.lever_up import VARIED_ACTION
+from foretrace.actions import Action
 from foretrace.errors import PlanningError
 from foretrace.imagined import Belief, ImaginedBatch, ImaginedEffect, Imaginer
 from foretrace.imagined.context import Context
@@ -61,16 +60,24 @@ class Search:
     checker: Imaginer | None
     context: Context | Belief
     config: "PlanConfig"
-    reach: Callable[[LeverUp], str | None] | None = None
+    reach: Callable[[Action], str | None] | None = None
+    known: "Search | None" = None
+    """A search for the same object, which has imagined the candidates around the outline."""
     rim: Rim = field(init=False)
+    rim_cost: RimCost = field(init=False)
+    around: Motions = field(init=False)
     lost: Counter[str] = field(default_factory=Counter, init=False)
     stages: list[Stage] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         self.rim = Rim(self.scene.outline)
         self.rng = np.random.default_rng(self.config.seed)
-        self.varied = tuple(name for name in VARIED_ACTION if name in self.imaginer.context)
-        if self.config.vary_path and not self.varied:
+        self.kind = kind = self.imaginer.action
+        self.cone = kind.cone if self.config.cone is None else self.config.cone
+        self.varied = tuple(name for name in kind.varied if name in self.imaginer.context)
+        vary = self.config.vary_path
+        self.vary = kind.path_matters and len(self.varied) > 0 if vary is None else vary
+        if self.vary and not self.varied:
             raise PlanningError(
                 f"the {self.imaginer.name} imaginer is conditioned on no parameter of the path: leave vary_path out"
             )
@@ -81,11 +88,25 @@ class Search:
         Raises:
             PlanningError: No contact is free, or the robot reaches none of the best.
         """
-        pool, scores = self._look_around()
-        rim = self._rim_cost(pool, scores)
+        pool, scores = self.look_around()
         if self.config.refine:
-            pool, scores = self._refine(pool, scores)
-        rows = self._shortlist(pool, scores)
+            pool, scores = self.refine(pool, scores)
+        return self.finish(pool, scores, T_table_object)
+
+    def finish(
+        self,
+        pool: Candidates,
+        scores: Scores,
+        T_table_object: Float[np.ndarray, "4 4"] | None = None,
+        chosen: int | None = None,
+    ) -> Plan:
+        """The plan from what was found: the best of the pool once it is checked, or a row that is chosen already.
+
+        Raises:
+            PlanningError: The robot reaches none of the best.
+        """
+        rim = self.rim_cost
+        rows = self._shortlist(pool, scores) if chosen is None else np.array([chosen])
         if self.checker is not None and self.checker.name != self.imaginer.name:
             scores, imagined, rows = self._check(pool, scores, rows)
         else:
@@ -111,28 +132,35 @@ class Search:
             T_table_object=T_table_object,
         )
 
-    def _look_around(self) -> tuple[Candidates, Scores]:
-        """Candidates on the whole outline."""
+    def look_around(self) -> tuple[Candidates, Scores]:
+        """Candidates on the whole outline.
+
+        Raises:
+            PlanningError: No contact is free.
+        """
         config, started = self.config, perf_counter()
         number = int(np.clip(round(self.rim.length / config.spacing), 3, MOST_CONTACTS))
         along = (np.arange(number) + 0.5) * self.rim.length / number
-        turns = np.linspace(-1, 1, config.directions) * config.cone if config.directions > 1 else np.zeros(1)
+        turns = np.linspace(-1, 1, config.directions) * self.cone if config.directions > 1 else np.zeros(1)
         along, turn = (each.ravel() for each in np.meshgrid(along, turns, indexing="ij"))
-        paths = [ToolPath()] * len(along)
-        if config.vary_path:
+        paths = [self.kind.nominal().path] * len(along)
+        if self.vary:
             paths += self._draw_paths(np.full((PATHS * len(along), len(self.varied)), 0.5), 1.0)
             along, turn = np.tile(along, 1 + PATHS), np.tile(turn, 1 + PATHS)
-        pool = self._free(place(self.rim, along, turn, paths))
+        pool = self._free(place(self.kind, self.rim, along, turn, paths))
         if not len(pool):
             why = ", ".join(f"at {count} {reason}" for reason, count in self.lost.items())
             raise PlanningError(
-                f"no contact of the object is free ({why}): lift it by hand, or give a smaller cone or another view"
+                f"no contact of the object is free ({why}): move it by hand, or give a smaller cone or another view"
             )
-        scores = self._score(self.imaginer, pool)
+        same = self.known is not None and self.known.scene.object is self.scene.object is not None
+        self.around = self.known.around if self.known and same else self.motions(self.imaginer, pool)
+        scores = self._score(self.around)
+        self.rim_cost = self._rim_cost(pool, scores)
         self._tell("imagined", pool, scores, started, None)
         return pool, scores
 
-    def _refine(self, pool: Candidates, scores: Scores) -> tuple[Candidates, Scores]:
+    def refine(self, pool: Candidates, scores: Scores) -> tuple[Candidates, Scores]:
         """Draw candidates around the best, in rounds; whatever was found stays in the pool."""
         config, started = self.config, perf_counter()
         for round in range(config.refine):
@@ -140,15 +168,15 @@ class Search:
             rows = self._distinct(pool, self._order(pool, scores), MODES)
             parents = rows[self.rng.integers(len(rows), size=config.samples)]
             along = pool.along[parents] + WIDTH * width * self.rng.normal(size=config.samples)
-            spread = TURN_SHARE * config.cone * width * self.rng.normal(size=config.samples)
-            turn = np.clip(pool.turn[parents] + spread, -config.cone, config.cone)
+            spread = TURN_SHARE * self.cone * width * self.rng.normal(size=config.samples)
+            turn = np.clip(pool.turn[parents] + spread, -self.cone, self.cone)
             paths = [pool.actions[k].path for k in parents]
-            if config.vary_path:
-                shares = np.array([self._shares(path) for path in paths])
+            if self.vary:
+                shares = np.array([self._shares(pool.actions[k]) for k in parents])
                 paths = self._draw_paths(shares, TURN_SHARE * width)
-            drawn = self._free(place(self.rim, along, turn, paths), count=False)
+            drawn = self._free(place(self.kind, self.rim, along, turn, paths), count=False)
             if len(drawn):
-                scores = scores.joined(self._score(self.imaginer, drawn))
+                scores = scores.joined(self._score(self.motions(self.imaginer, drawn)))
                 pool = pool.joined(drawn)
         self._tell("refined", pool, scores, started, self.stages[-1].cost)
         return pool, scores
@@ -160,9 +188,7 @@ class Search:
         assert self.checker is not None
         started, chosen = perf_counter(), pool[rows]
         batch = self._imagine(self.checker, chosen)
-        motions = Motions.of(batch, chosen.actions, self.scene.outline, self.scene.height)
-        check_outcomes(self.goal, batch.futures.outcome, self.checker.name)
-        own = score(self.goal, motions, self.config.criterion, self.config.tail)
+        own = self._score(self._motions(self.checker, batch, chosen))
         blended = scores[rows].blended(own, TRUST)
         order = self._order(chosen, blended)
         names = ("cost", "reached", "chances")
@@ -180,10 +206,24 @@ class Search:
             com=self.scene.com_in_view,
         )
 
-    def _score(self, imaginer: Imaginer, candidates: Candidates) -> Scores:
-        batch = self._imagine(imaginer, candidates)
+    def motions(self, imaginer: Imaginer, candidates: Candidates) -> Motions:
+        """What an imaginer imagines of candidates.
+
+        Raises:
+            PlanningError: The goal is about an outcome that the imaginer does not tell.
+        """
+        return self._motions(imaginer, self._imagine(imaginer, candidates), candidates)
+
+    def _motions(self, imaginer: Imaginer, batch: ImaginedBatch, candidates: Candidates) -> Motions:
         check_outcomes(self.goal, batch.futures.outcome, imaginer.name)
-        motions = Motions.of(batch, candidates.actions, self.scene.outline, self.scene.height)
+        scene = self.scene
+        return Motions.of(batch, candidates.actions, scene.outline, scene.height, imaginer.rests)
+
+    def _score(self, motions: Motions) -> Scores:
+        """What candidates are worth, from the frame of the goal."""
+        scene = self.scene
+        if scene.T_start_now is not None and scene.com_start is not None:
+            motions = motions.continuing(scene.T_start_now, scene.com_start)
         return score(self.goal, motions, self.config.criterion, self.config.tail)
 
     def _free(self, candidates: Candidates, count: bool = True) -> Candidates:
@@ -192,22 +232,19 @@ class Search:
             self.lost.update(reasons)
         return candidates[np.flatnonzero(free)]
 
-    def _shares(self, path: ToolPath) -> list[float]:
-        """Where a path's parameters lie within their ranges."""
-        values = path.parameters()
-        return [
-            (values[name] - low) / (high - low)
-            for name, (low, high) in VARIED_ACTION.items()
-            if name in self.varied
-        ]
+    def _shares(self, action: Action) -> list[float]:
+        """Where the parameters of an action's path lie within their ranges."""
+        values = action.parameters()
+        ranges = {name: self.kind.varied[name] for name in self.varied}
+        return [(values[name] - low) / (high - low) for name, (low, high) in ranges.items()]
 
-    def _draw_paths(self, shares: Float[np.ndarray, "n names"], width: float) -> list[ToolPath]:
+    def _draw_paths(self, shares: Float[np.ndarray, "n names"], width: float) -> list[Any]:
         """Paths around those with parameters at some shares of their ranges; a width of 1 covers these."""
         drawn = np.clip(shares + width * self.rng.uniform(-0.5, 0.5, size=shares.shape), 0.0, 1.0)
-        ranges = [VARIED_ACTION[name] for name in self.varied]
+        ranges = [self.kind.varied[name] for name in self.varied]
         values = [low + drawn[:, k] * (high - low) for k, (low, high) in enumerate(ranges)]
         return [
-            ToolPath.of(**dict(zip(self.varied, row, strict=True)))
+            self.kind.path_of(**dict(zip(self.varied, row, strict=True)))
             for row in np.stack(values, axis=1).tolist()
         ]
 

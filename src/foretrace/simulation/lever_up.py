@@ -306,7 +306,9 @@ def replay(interaction: Interaction) -> Interaction:
     )
 
 
-def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics) -> Effect:
+def effect_of(
+    motion: Motion, obj: ObjectModel, action: Action, physics: Physics, to_rest: bool = False
+) -> Effect:
     """The record of an effect: what was seen, and what the action's judge concludes.
 
     Args:
@@ -314,6 +316,7 @@ def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics
         obj: The object.
         action: The executed action.
         physics: Friction and density.
+        to_rest: The motion goes on after the path's end, and is judged until there.
     """
     if motion.diverged:
         empty, unknown = np.empty((0, 7)), np.full((2, 2), np.nan)
@@ -322,7 +325,12 @@ def effect_of(motion: Motion, obj: ObjectModel, action: Action, physics: Physics
     motion, fall = _until_the_floor(motion, obj, physics)
     rotation = quaternion_to_matrix(motion.object_pose[:, 3:])
     com = motion.object_pose[:, :3] + rotation @ obj.mass_properties(physics.density).com
-    return Effect.judged(motion, obj, action, com, fall)
+    if not to_rest:
+        return Effect.judged(motion, obj, action, com, fall)
+    count = int(np.searchsorted(motion.times, action.duration + 1e-9, side="right"))
+    judged = Effect.judged(_cut(motion, count), obj, action, com[:count], fall)
+    whole = {"times": motion.times, "pose_trajectory": motion.object_pose, "com_trajectory": com}
+    return replace(judged, **whole, tool_trajectory=motion.tool_pose, joint_trajectory=motion.joints)
 
 
 def _transformed(effect: Effect, T_commanded_executed: Float[np.ndarray, "4 4"]) -> Effect:
@@ -345,6 +353,11 @@ def _until_the_floor(motion: Motion, obj: ObjectModel, physics: Physics) -> tupl
     if physics.table_edge is None or (height > 0).all():
         return motion, None
     end = int((height < -FALL_DEPTH).argmax()) or len(height)
+    return _cut(motion, end), int((height <= 0).argmax())
+
+
+def _cut(motion: Motion, count: int) -> Motion:
+    """The first samples of a motion."""
     names = ("times", "object_pose", "tool_pose", "joints", "on_tool", "table_contacts")
-    cut = {name: values[:end] for name in names if (values := getattr(motion, name)) is not None}
-    return replace(motion, **cut), int((height <= 0).argmax())
+    cut = {name: values[:count] for name in names if (values := getattr(motion, name)) is not None}
+    return replace(motion, **cut)

@@ -32,8 +32,20 @@ class Footprint:
 
     outline: Float[np.ndarray, "n 2"]
     """Corners, counter-clockwise, in the object frame [m]; the rod meets a dent at one point at a time."""
-    feet: Float[np.ndarray, "feet 2"]
-    """Where it touches the table, with equal shares of its weight, in the object frame [m]."""
+    feet: Float[np.ndarray, "*pushes feet 2"]
+    """Where it touches the table, with equal shares of its weight, in the object frame [m]; in each push elsewhere, or
+    the same in all."""
+
+
+class Slide(NamedTuple):
+    """Motions of pushed objects, after each step; the first is rest."""
+
+    position: Float[np.ndarray, "pushes steps_and_one 2"]
+    """Displacement of the object frame's origin, in the object frame at rest [m]."""
+    angle: Float[np.ndarray, "pushes steps_and_one"]
+    """Turn to the left [rad]."""
+    gap: Float[np.ndarray, " pushes"]
+    """Distance of the rod's surface from the object at the end [m]; below 0 where it has entered."""
 
 
 class _Contact(NamedTuple):
@@ -63,12 +75,31 @@ def slide(
     footprint: Footprint,
     start: Plane,
     motion: Plane,
-    radius: float,
-    friction: float,
+    radius: float | Float[np.ndarray, " pushes"],
+    friction: float | Float[np.ndarray, " pushes"],
     steps: int = 60,
     iterations: int = 6,
 ) -> tuple[Plane, Float[np.ndarray, " pushes"]]:
-    """Final poses of an object that a vertical rod pushes along straight lines.
+    """Final poses of an object that a vertical rod pushes along straight lines; arguments as of `slide_along`.
+
+    Returns:
+        Displacement of the object frame's origin [m] and turn to the left [rad] of each push, in the object frame at
+        rest.
+    """
+    found = slide_along(footprint, start, motion, radius, friction, steps, iterations)
+    return found.position[:, -1], found.angle[:, -1]
+
+
+def slide_along(
+    footprint: Footprint,
+    start: Plane,
+    motion: Plane,
+    radius: float | Float[np.ndarray, " pushes"],
+    friction: float | Float[np.ndarray, " pushes"],
+    steps: int = 60,
+    iterations: int = 6,
+) -> Slide:
+    """Motions of an object that a vertical rod pushes along straight lines.
 
     Args:
         footprint: The object.
@@ -78,12 +109,11 @@ def slide(
         friction: Friction coefficient between rod and object.
         steps: Steps into which each push is cut.
         iterations: Iterations of the solver in a step.
-
-    Returns:
-        Displacement of the object frame's origin [m] and turn to the left [rad] of each push, in the object frame at
-        rest.
     """
     count = len(start)
+    friction = np.broadcast_to(friction, count)
+    feet = np.broadcast_to(footprint.feet, (count, *footprint.feet.shape[-2:]))
+    positions, angles = np.zeros((count, steps + 1, 2)), np.zeros((count, steps + 1))
     position, angle = np.zeros((count, 2)), np.zeros(count)
     memory = _Memory(
         np.zeros(count), np.zeros((count, 2)), np.zeros(count, dtype=int), np.ones(count, dtype=bool)
@@ -95,13 +125,17 @@ def slide(
         if len(rows):
             touching = _Contact(*(values[rows] for values in contact))
             advance = rotate_plane(motion[rows] / steps, -angle[rows])
-            shift, turn = _follow(footprint.feet, touching, advance, friction, iterations, rows, memory)
+            shift, turn = _follow(feet[rows], touching, advance, friction[rows], iterations, rows, memory)
             position[rows] += rotate_plane(shift, angle[rows] + turn / 2)
             angle[rows] += turn
-    return position, angle
+        positions[:, step], angles[:, step] = position, angle
+    end = _touch(footprint.outline, rotate_plane(start + motion - position, -angle), radius)
+    return Slide(positions, angles, -end.depth)
 
 
-def _touch(outline: Float[np.ndarray, "n 2"], rod: Plane, radius: float) -> _Contact:
+def _touch(
+    outline: Float[np.ndarray, "n 2"], rod: Plane, radius: float | Float[np.ndarray, " pushes"]
+) -> _Contact:
     """The point of an outline that is nearest to each rod."""
     along = np.roll(outline, -1, axis=0) - outline
     lengths = np.linalg.norm(along, axis=1)
@@ -119,10 +153,10 @@ def _touch(outline: Float[np.ndarray, "n 2"], rod: Plane, radius: float) -> _Con
 
 
 def _follow(
-    feet: Float[np.ndarray, "feet 2"],
+    feet: Float[np.ndarray, "touching feet 2"],
     contact: _Contact,
     advance: Plane,
-    friction: float,
+    friction: Float[np.ndarray, " touching"],
     iterations: int,
     rows: Int[np.ndarray, " touching"],
     memory: _Memory,
@@ -159,7 +193,7 @@ def _follow(
     slips = np.flatnonzero(side)
     if len(slips):
         n, sides = normal[slips], side[slips]
-        edge = n + friction * sides[:, None] * tangent[slips]  # of the friction cone
+        edge = n + (friction[slips] * sides)[:, None] * tangent[slips]  # of the friction cone
         changed = memory.side[rows[slips]] != sides
         first = memory.sliding[rows[slips]]
         first[changed] = np.column_stack([np.zeros(changed.sum()), turning[slips][changed]])

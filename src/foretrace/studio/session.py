@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import ForetraceError, StudioError
 from foretrace.geometry import Numbers, finite_array, transform_points
 from foretrace.imagined import IMAGINERS, Belief, ImaginedEffect, Imaginer, conformal_scores
@@ -100,7 +100,7 @@ class Session:
         ring = shapely.LinearRing(self.choices.object.corners)
         self.change(along=float(ring.project(shapely.Point(point)) / ring.length))
 
-    def take(self, action: LeverUp) -> None:
+    def take(self, action: Action) -> None:
         """Choose contact, direction and path of a lever-up on this object."""
         ring = shapely.LinearRing(self.choices.object.corners)
         along = float(ring.project(shapely.Point(action.contact)) / ring.length)
@@ -117,7 +117,9 @@ class Session:
         """The lever-up that is chosen, in the object's frame."""
         rim, chosen = Rim(self.choices.object.corners), self.choices
         along = np.array([chosen.along * rim.length])
-        return place(rim, along, np.array([chosen.turn]), [chosen.path]).actions[0]
+        found = place(LeverUp, rim, along, np.array([chosen.turn]), [chosen.path]).actions[0]
+        assert isinstance(found, LeverUp)
+        return found
 
     @property
     def imagined(self) -> ImaginedEffect:

@@ -10,3 +10,7 @@ __all__ = ["TwinCalibration", "TwinConfig", "TwinImaginer"]
 
 # A prism's outline is found in the view as exactly as its place would be, and sooner.
 IMAGINERS.add("twin", lambda obj: TwinImaginer(object=None if type(obj) is Prism else obj))
+IMAGINERS.add(
+    "twin-to-rest",
+    lambda obj: TwinImaginer(config=TwinConfig(set_down=True), object=None if type(obj) is Prism else obj),
+)

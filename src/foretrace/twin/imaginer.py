@@ -66,6 +66,8 @@ class TwinConfig:
     """Time between samples [s]."""
     watch_time: float = 0.0
     """Time for which the object is observed after the end of the nominal path [s]."""
+    set_down: bool = False
+    """Whether the blade goes back the way it came, until the object rests on the table: for sequences of lever-ups."""
     seed: int = 0
     """Decides what is drawn."""
     workers: int | None = None
@@ -131,10 +133,17 @@ class TwinImaginer(Imaginer):
         """The object, where it is known."""
         self.calibration = check_calibration(calibration)
         """How far the twin is off."""
-        duration = NOMINAL.duration + config.watch_time
+        duration = LeverUp.nominal().time_to_rest if config.set_down else NOMINAL.duration
+        duration += config.watch_time
+        self.rests = config.set_down
         samples = round(duration / config.sample_period)
         self._player = Player(
-            engine, config.embodiment, config.timestep, config.sample_period, samples * config.sample_period
+            engine,
+            config.embodiment,
+            config.timestep,
+            config.sample_period,
+            samples * config.sample_period,
+            config.set_down,
         )
         check_player(self._player)
         self._times = np.arange(samples + 1) * config.sample_period

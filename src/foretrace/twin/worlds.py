@@ -51,6 +51,8 @@ class Player:
     """Time between samples [s]."""
     duration: float
     """Time of a motion [s]."""
+    set_down: bool = False
+    """Whether the tool goes back the way it came: outcomes are those of the way there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,10 +187,9 @@ def play(player: Player, world: World) -> Played | None:
         placed = _placed(world)
         executed = placed if world.offset == NO_OFFSET else placed.moved(**vars(world.offset))
         pose = world.T_action_object if executed is placed else executed.T_action_object
-        motion = engine.play(
-            world.model, pose, executed.tool, executed.tool_motion, player.duration, world.physics
-        )
-        effect = effect_of(motion, world.model, executed, world.physics)
+        way = executed.motion_to_rest if player.set_down else executed.tool_motion
+        motion = engine.play(world.model, pose, executed.tool, way, player.duration, world.physics)
+        effect = effect_of(motion, world.model, executed, world.physics, player.set_down)
     except (SimulationError, ShapeError) as error:
         raise PredictionError(f"the twin cannot play the action: {error}") from error
     if effect.outcome == FAILED:

@@ -16,7 +16,7 @@ from foretrace.planning.goals.base import (
     describe,
 )
 from foretrace.planning.goals.lifting import KeepUpright, Lift, Tilt, Tumble, TurnOver
-from foretrace.planning.goals.moving import Avoid, Move, MoveTo, SlideOff
+from foretrace.planning.goals.moving import Avoid, Move, MoveTo, SlideOff, Turn
 
 __all__ = [
     "ANGLE",
@@ -34,6 +34,7 @@ __all__ = [
     "Tilt",
     "Total",
     "Tumble",
+    "Turn",
     "TurnOver",
     "as_goal",
     "describe",

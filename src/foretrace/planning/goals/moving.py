@@ -7,7 +7,6 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from foretrace.actions.lever_up import APPROACH
 from foretrace.errors import PlanningError, fault, is_number, shown
 from foretrace.geometry import finite_array, wrap_angle
 from foretrace.planning.goals.base import (
@@ -114,6 +113,32 @@ class MoveTo(Goal):
 
 
 @dataclass(frozen=True)
+class Turn(Goal):
+    """Turn the object about the vertical, wherever it goes."""
+
+    label = "turn"
+    angle: float
+    """The turn to the left [rad]."""
+    tolerance: float = 0.17
+    """Deviation up to which the goal counts as reached [rad]."""
+
+    def __post_init__(self) -> None:
+        check_angle("angle", self.angle, -np.pi, np.pi)
+        check_angle("tolerance", self.tolerance, 0.0, np.pi)
+
+    def _off(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
+        return np.abs(wrap_angle(motions.heading - self.angle))
+
+    def cost(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
+        """Deviation from the turn."""
+        return self._off(motions) / ANGLE
+
+    def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
+        """Within the tolerance."""
+        return self._off(motions) <= self.tolerance
+
+
+@dataclass(frozen=True)
 class SlideOff(Goal):
     """Bring the centre of mass beyond a straight edge of the table."""
 
@@ -148,7 +173,7 @@ class SlideOff(Goal):
 
 @dataclass(frozen=True, eq=False)
 class Avoid(Goal):
-    """Keep a zone free: neither the object, nor the blade on its straight way to the contact, enters it.
+    """Keep a zone free: neither the object, nor the tool on its straight way to the contact, enters it.
 
     The zone is entered where the outline from above, grown by the prediction region's radius, meets it.
     """
@@ -198,7 +223,7 @@ class Avoid(Goal):
                 radius = np.where(np.isfinite(found), found, 0.0)
             inside = np.where(motions.counts[rows][:, samples], apart <= radius, False)
             entered[rows, columns] = inside.any(axis=1)
-        side, near, far = APPROACH
+        side, near, far = motions.actions[0].approach
         ways = np.array(
             [
                 [action.contact - far * action.direction, action.contact - near * action.direction]

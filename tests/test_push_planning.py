@@ -1,0 +1,138 @@
+"""Pushes that are imagined, planned and watched by the sliding twin."""
+
+import numpy as np
+import pytest
+
+import foretrace as ft
+from foretrace.errors import PlanningError, PredictionError
+from foretrace.objects import NO_BEVEL
+from foretrace.simulation.sliding import Footprint, slide, slide_along
+from foretrace.twin.sliding import NAMES, SlidingTwin
+
+SIDE = 0.09
+PLATE = ft.Prism(SIDE / 2 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), 0.013, NO_BEVEL)
+QUICK = ft.PlanConfig(spacing=0.015, directions=3, refine=3, samples=48)
+TWIN = SlidingTwin(worlds=8)
+
+
+def imagine(push: ft.Push, **settings):
+    return TWIN.imagine(ft.TopDownView.of(PLATE, push), push, **settings)
+
+
+def test_a_push_through_the_middle_is_imagined_straight():
+    imagined = imagine(ft.Push.at_edge(PLATE, 0, path=ft.PushPath(distance=0.03)))
+    moved = imagined.com_trajectory[-1] - imagined.com_trajectory[0]
+    np.testing.assert_allclose(moved, [0.03, 0, 0], atol=5e-4)
+    assert imagined.futures.outcomes()["pushed"] == 1
+    assert np.isnan(imagined.futures.radius(0.9)).all()  # one world tells no spread
+
+
+@pytest.mark.parametrize("fraction", [0.2, 0.7])
+def test_an_imagined_push_is_that_of_the_quasi_static_model(fraction):
+    """Seen from the object or from the push, with the outline from the view or known: the same motion."""
+    push = ft.Push.at_edge(PLATE, 1, fraction).moved(0.0, 0.0, 0.2)
+    from foretrace.objects.footed import feet_of
+
+    start = push.contact - (push.path.approach + push.tool.radius) * push.direction
+    footprint = Footprint(PLATE.corners, feet_of(PLATE.corners, "uniform"))
+    shift, turn = slide(
+        footprint, start[None], (push.path.length * push.direction)[None], push.tool.radius, 0.2, 40
+    )
+    imagined = imagine(push)
+    moved = imagined.com_trajectory[-1, :2] - imagined.com_trajectory[0, :2]
+    np.testing.assert_allclose(moved, push.T_action_object[:2, :2] @ shift[0], atol=1e-3)
+    np.testing.assert_allclose(imagined.futures.states[0, 0, -1, 5], turn[0], atol=0.02)
+
+
+def test_what_is_not_told_widens_the_regions():
+    push = ft.Push.at_edge(PLATE, 0, 0.8)
+    unknown, friction = imagine(push, context="unknown"), imagine(push, context={"contact_error": 0.0})
+    wide, narrow = (np.nanmax(each.futures.spread[0, 0]) for each in (unknown, friction))
+    assert wide > narrow > 1e-3
+    assert np.isfinite(unknown.futures.radius(0.5)[0, 0]).all()
+
+
+def test_a_rod_beside_the_object_loses_it():
+    far = ft.Push.at_edge(PLATE, 0, 0.95, path=ft.PushPath(distance=0.11))
+    assert imagine(far).futures.outcomes()["turned away"] == 1
+
+
+def test_frictions_and_feet_may_differ_between_pushes():
+    feet = Footprint(PLATE.corners, np.array([[0.03, 0.0], [-0.03, 0.0], [0.0, 0.03], [0.0, -0.03]]))
+    start, motion = np.tile([-0.052, 0.02], (2, 1)), np.tile([0.03, 0.01], (2, 1))
+    both = slide_along(feet, start, motion, 0.00475, np.array([0.1, 0.4]))
+    for row, friction in enumerate((0.1, 0.4)):
+        one = slide(feet, start[:1], motion[:1], 0.00475, friction)
+        np.testing.assert_allclose(both.position[row, -1], one[0][0], atol=1e-9)
+    assert np.abs(both.position[0, -1] - both.position[1, -1]).max() > 1e-3
+
+
+def test_a_plan_pushes_the_object_where_it_shall_be(tmp_path):
+    goal = ft.goals.MoveTo((0.03, 0.0), turn=0.0, tolerance=0.005, turn_tolerance=0.09)
+    plan = ft.plan(PLATE, goal, TWIN, config=QUICK)
+    assert isinstance(plan.action, ft.Push)
+    assert plan.reached == 1
+    assert not plan.note
+    again = ft.Plan.open(plan.save(tmp_path / "plan.json"))
+    assert again.action.to_dict() == plan.action.to_dict()
+    assert "push at" in repr(again)
+
+
+BAD = {
+    "a push of another time": (
+        lambda: imagine(ft.Push.at_edge(PLATE, 0, path=ft.PushPath(distance=0.4))),
+        PredictionError,
+        "the push takes 20.5 s, the twin imagines 6 s: give a shorter one",
+    ),
+    "a lever-up": (
+        lambda: TWIN.imagine(
+            ft.TopDownView.of(PLATE, ft.LeverUp.at_edge(PLATE, 0)), ft.LeverUp.at_edge(PLATE, 0)
+        ),
+        PredictionError,
+        "a lever-up never ends 'pushed', as sliding twin has it",
+    ),
+    "a lift": (
+        lambda: ft.plan(PLATE, ft.goals.Lift(), TWIN, config=QUICK),
+        PlanningError,
+        "about the outcome levered, the sliding twin imaginer tells pushed, turned away, missed",
+    ),
+    "two kinds": (
+        lambda: ft.plan(PLATE, ft.goals.MoveTo((0.03, 0)), TWIN, checker=ft.TwinImaginer()),
+        PlanningError,
+        "the sliding twin imagines a push, the checker twin a lever-up: give two",
+    ),
+    "friction of the table": (
+        lambda: imagine(ft.Push.at_edge(PLATE, 0), context={"friction": 0.5}),
+        PredictionError,
+        "not on 'friction': leave it out of context",
+    ),
+    "worlds": (
+        lambda: SlidingTwin(worlds=1),
+        PredictionError,
+        "worlds is 1, duration 6.0: give a whole number from 2",
+    ),
+    "a shape that was never pushed": (
+        lambda: TWIN.of_shape("abs", "rect1"),
+        PredictionError,
+        "shape 'rect1' on 'abs' was never pushed: choose from none",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_is_named_in_a_line(name):
+    make, kind, text = BAD[name]
+    with pytest.raises(kind, match=text) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_the_constants_of_a_shape_decide_its_pushes():
+    values = np.zeros(len(NAMES))
+    values[0] = np.log(0.4 / 0.2)
+    twin = SlidingTwin(own={("", "plate"): values}).of_shape("", "plate")
+    assert twin.friction == pytest.approx(0.4)
+    push = ft.Push.at_edge(PLATE, 0, 0.7).moved(0.0, 0.0, 0.4)
+    told = imagine(push, context={"tool_friction": 0.4, "contact_error": 0.0})
+    own = twin.imagine(ft.TopDownView.of(PLATE, push), push)
+    np.testing.assert_allclose(own.com_trajectory, told.com_trajectory, atol=1e-9)
