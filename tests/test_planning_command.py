@@ -53,6 +53,24 @@ def test_polygon_to_plan_to_robot(files: Path, capsys: pytest.CaptureFixture[str
     assert "goal: Lift(" in capsys.readouterr().out
 
 
+def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = "plan --polygon outline.txt --action push --goal move-to --position 0.09 0.06 --turn 0.6"
+    assert run(f"{command} --steps 3 --spacing 0.04 --refine 1 --samples 16 --tool-friction 0.25") == 0
+    told = capsys.readouterr().out
+    assert "push 1: contact x" in told
+    content = json.loads(Path("plan/sequence.json").read_text())
+    first = ft.Plan.open("plan/plan.json")
+    assert content["actions"][0] == first.action.to_dict()
+    assert len(content["T_start_object"]) == len(content["actions"]) + 1
+    assert run("robot plan/plan.json --base base.json") == 2
+    refused = capsys.readouterr().err
+    assert "does not know where the object lies" in refused
+    assert run(f"{command} --steps 3 --base base.json --pose 0 0 0") == 2
+    assert "--base goes with one action" in capsys.readouterr().err
+    assert run(f"{command} somewhere") == 2
+    assert "somewhere learned single lever-ups: leave it out" in capsys.readouterr().err
+
+
 def test_object_of_a_data_set(files: Path) -> None:
     tool = ft.SimulationConfig(embodiment="tool")
     ft.collect(ft.CollectConfig(1, 1, simulation=tool), "data", workers=1)

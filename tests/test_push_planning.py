@@ -136,3 +136,95 @@ def test_the_constants_of_a_shape_decide_its_pushes():
     told = imagine(push, context={"tool_friction": 0.4, "contact_error": 0.0})
     own = twin.imagine(ft.TopDownView.of(PLATE, push), push)
     np.testing.assert_allclose(own.com_trajectory, told.com_trajectory, atol=1e-9)
+
+
+def tracked(push: ft.Push, friction: float):
+    """Times and poses of the simulated push."""
+    from foretrace.objects import Footed
+
+    physics = ft.Physics(tool_friction=friction)
+    effect = ft.simulate(
+        Footed(PLATE), push, embodiment="tool", physics=physics, timestep=0.004, sample_period=0.04
+    ).effect
+    return effect.times, effect.pose_trajectory
+
+
+def watch(push: ft.Push, times, poses):
+    """The last verdict, or the first alarm."""
+    belief = ft.Belief({"tool_friction": (0.1, 0.5)}, worlds=32)
+    monitor = ft.Monitor(imagine(push, context=belief))
+    for t, pose in zip(times, poses, strict=True):
+        verdict = monitor.update(float(t), pose)
+        if verdict.alarm:
+            return verdict
+    return verdict
+
+
+def test_a_push_is_watched():
+    """As imagined: no alarm. Blocked half way, or turned away by another rod's path: an alarm."""
+    push = ft.Push.at_edge(PLATE, 0, 0.7)
+    times, poses = tracked(push, 0.25)
+    calm = watch(push, times, poses)
+    assert not calm.alarm
+    assert calm.outcomes["pushed"] > 0.9
+    half = len(times) // 2
+    blocked = watch(push, times, np.where(np.arange(len(times))[:, None] < half, poses, poses[half]))
+    assert blocked.alarm
+    assert times[half] < blocked.time < times[-1] - 0.1
+    beside = push.moved(0.0, 0.035, 0.0)  # it turns out of the rod's way
+    _, other = tracked(beside, 0.25)
+    T = push.T_action_object @ np.linalg.inv(beside.T_action_object)
+    from foretrace.geometry import matrix_to_pose, pose_to_matrix
+
+    assert watch(push, times, matrix_to_pose(T @ pose_to_matrix(other))).alarm
+
+
+@pytest.mark.slow
+def test_a_push_tells_the_friction_of_the_rod():
+    """Observed in a world like the twin's, slanting enough for the friction to decide."""
+    push = ft.Push.at_edge(PLATE, 0, 0.75, path=ft.PushPath(0.03, speed=0.1)).moved(0.0, 0.0, 0.5)
+    twin, view = ft.SlidingTwin(steps=8, duration=1.0), ft.TopDownView.of(PLATE, push)
+    seen = twin.imagine(view, push, context={"tool_friction": 0.45, "contact_error": 0.0})
+    poses = seen.object_poses(push.T_action_object)
+    prior = ft.Belief({"tool_friction": (0.05, 0.6)} | dict.fromkeys(("com_x", "com_y"), (-0.001, 0.001)))
+    belief = ft.identify(view, push, ft.ObservedMotion(seen.times, poses), prior, imaginer=twin)
+    assert belief.mean["tool_friction"] > prior.mean["tool_friction"] + 0.03
+
+
+@pytest.mark.slow
+def test_constants_are_identified_from_pushes_that_were_carried_out():
+    from foretrace.errors import DatasetError
+    from foretrace.interactions.pushes import RecordedPushes
+    from foretrace.objects import Footed
+
+    made = []
+    for k in range(2):
+        push = ft.Push.at_edge(PLATE, k, 0.75, path=ft.PushPath(0.03, speed=0.05)).moved(0.0, 0.0, 0.5)
+        made.append(
+            ft.simulate(
+                Footed(PLATE), push, embodiment="tool", physics=ft.Physics(tool_friction=0.5), timestep=0.004,
+                sample_period=0.04,
+            )
+        )  # fmt: skip
+    pushes = RecordedPushes.of(made, "table")
+    assert len(pushes) == 2
+    assert [shape.name for shape in pushes.shapes] == ["object 0"]
+    end = made[0].effect.com_trajectory[-1] - made[0].effect.com_trajectory[0]
+    np.testing.assert_allclose(
+        pushes.displacement()[0, :2], made[0].action.T_action_object[:2, :2].T @ end[:2], atol=1e-5
+    )
+    twin = SlidingTwin.identified(pushes).of_shape("table", "object 0")
+    assert twin.friction != SlidingTwin().friction
+    off, nominal = (
+        np.abs(each.predict(pushes) - pushes.displacement())[:, :2].max()
+        for each in (SlidingTwin.identified(pushes), SlidingTwin())
+    )
+    assert off < nominal
+    assert np.all(np.diag(twin.doubt) <= np.diag(SlidingTwin().doubt) + 1e-9)
+    lever = ft.simulate(
+        ft.Box(0.1, 0.1, 0.03), ft.LeverUp.at_edge(ft.Box(0.1, 0.1, 0.03), 0), embodiment="tool"
+    )
+    with pytest.raises(
+        DatasetError, match=r"is a lever-up that ended .*: give pushes that left their objects flat"
+    ):
+        RecordedPushes.of([lever])

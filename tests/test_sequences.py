@@ -17,9 +17,9 @@ from foretrace.simulation.world import SimulatedWorld
 
 SIDE = 0.09
 PLATE = ft.Prism(SIDE / 2 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), 0.013, NO_BEVEL)
-QUICK = ft.PlanConfig(spacing=0.03, directions=3, refine=2, samples=24)
-TWIN = ft.SlidingTwin()
-FAR = ft.goals.MoveTo((0.06, 0.06), turn=0.6, tolerance=0.01, turn_tolerance=0.15)
+QUICK = ft.PlanConfig(spacing=0.04, directions=3, refine=2, samples=16)
+TWIN = ft.SlidingTwin(steps=16)
+FAR = ft.goals.MoveTo((0.06, 0.06), turn=0.6, tolerance=0.012, turn_tolerance=0.2)
 T = planar_transform([0.02, -0.01, 0.0], 0.7)
 
 
@@ -105,7 +105,7 @@ def test_a_sequence_goes_where_one_push_does_not(tmp_path):
     assert several.reached >= 0.5 > one.reached
     assert len(several.actions) == len(several.frames) - 1 >= 2
     end = transform_points(several.frames[-1], np.zeros((1, 3)))[0, :2]
-    np.testing.assert_allclose(end, [0.06, 0.06], atol=0.011)
+    np.testing.assert_allclose(end, [0.06, 0.06], atol=0.013)
     content = json.loads(several.save(tmp_path / "sequence.json").read_text())
     assert len(content["actions"]) == len(several.actions)
     with pytest.raises(PlanningError, match=r"sequence\.json"):
@@ -113,8 +113,10 @@ def test_a_sequence_goes_where_one_push_does_not(tmp_path):
 
 
 def test_planning_again_makes_up_for_what_the_world_adds():
-    """Every push turns the object by 0.1 rad more than imagined."""
-    again, blind = (execute_sequence(Moved(0.1), FAR, 5, TWIN, config=QUICK, replan=r) for r in (True, False))
+    """Every push turns the object by 0.15 rad more than imagined."""
+    again, blind = (
+        execute_sequence(Moved(0.15), FAR, 5, TWIN, config=QUICK, replan=r) for r in (True, False)
+    )
     assert again.reached
     assert not blind.reached
     assert again.cost < blind.cost
@@ -131,6 +133,8 @@ def test_a_simulated_world_keeps_where_the_object_lies():
     assert world.act(push, T) == "pushed"
     moved = np.linalg.inv(T) @ world.locate()
     np.testing.assert_allclose(moved[:2, 3], 0.02 * push.direction, atol=1.5e-3)
+    assert world.act(push, T) == "missed"  # it is not there any more
+    world.T_table_object = T @ planar_transform([*(-0.01 * push.direction), 0.0], 0.0)
     assert world.act(push, T) == "failed"  # the rod would begin in the object
     world.T_table_object = np.diag([1.0, -1.0, -1.0, 1.0])
     with pytest.raises(SimulationError, match="lies on another side"):
@@ -164,6 +168,10 @@ BAD = {
     "a goal that is reached": (
         lambda: plan_sequence(PLATE, ft.goals.MoveTo((0.0, 0.0)), 2, TWIN),
         r"the goal MoveTo\(position=\(0, 0\)\) is reached already: give another one",
+    ),
+    "a lift": (
+        lambda: plan_sequence(PLATE, ft.goals.Lift(), 2),
+        r"the goal Lift\(\) is about an object that is levered, a sequence ends with the object at rest",
     ),
     "far away": (
         lambda: plan_sequence(PLATE, ft.goals.MoveTo((3.0, 0.0)), 2, TWIN),

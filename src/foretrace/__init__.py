@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         paper_objects,
         sample_prism,
     )
-    from foretrace.planning import Plan, PlanConfig, goals, plan
+    from foretrace.planning import Plan, PlanConfig, execute_sequence, goals, plan, plan_sequence
     from foretrace.predictor import (
         EffectPredictor,
         LstmConfig,
@@ -58,7 +58,7 @@ _HOMES = {
         *("paper_objects", "sample_prism"),
     ),
     "foretrace.features": ("FeatureExtractor",),
-    "foretrace.planning": ("Plan", "PlanConfig", "goals", "plan"),
+    "foretrace.planning": ("Plan", "PlanConfig", "execute_sequence", "goals", "plan", "plan_sequence"),
     "foretrace.predictor": (
         *(
             "EffectPredictor",
@@ -116,11 +116,13 @@ __all__ = [
     "Verdict",
     "Weighted",
     "collect",
+    "execute_sequence",
     "goals",
     "identify",
     "load_predictor",
     "paper_objects",
     "plan",
+    "plan_sequence",
     "replay",
     "sample_prism",
     "simulate",

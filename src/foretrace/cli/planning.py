@@ -1,9 +1,10 @@
-"""The command that chooses a lever-up."""
+"""The command that chooses an action, or several in a row."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
@@ -15,13 +16,13 @@ from foretrace.perception.photo import PhotoConfig
 from foretrace.planning import PlanConfig, goals
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from foretrace.imagined import Imaginer
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import ObjectModel
     from foretrace.perception.photo import PhotoView
     from foretrace.planning import Plan
 
+ActionName = Literal["lever-up", "push"]
 GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "turn", "slide-off"]
 BELONGS: dict[str, tuple[GoalName, ...]] = {
     "max_slip": ("lift", "tilt", "move"),
@@ -138,10 +139,12 @@ def plan(
     physics: Annotated[OmitArgPrefixes[PhysicsOptions], arg(name="physics")],
     search: Annotated[OmitArgPrefixes[PlanConfig], arg(name="search")],
     run: Positional[Path | None] = None,
+    action: ActionName = "lever-up",
+    steps: int = 1,
     unknown: bool = False,
     out: Path = Path("plan"),
 ) -> None:
-    """Choose where, which way and how an object is levered, so that a goal is reached.
+    """Choose where, which way and how an object is levered up or pushed, so that a goal is reached.
 
     Give the object as --polygon, --image or --mesh, of a data set as --data and --id, or on a --photo of the table.
 
@@ -153,13 +156,14 @@ def plan(
         physics: What is known of the physics; by default the nominal constants.
         search: How candidates are searched.
         run: Folder of a training that imagines; by default the predictor that comes with foretrace.
+        action: What the object is moved by. Pushes are imagined by the quasi-static twin.
+        steps: Actions in a row, at most. With more than one, they are planned until the object rests after each:
+            plan.json has the first, sequence.json all of them.
         unknown: Tell the imaginers only the constants that are given here; by default the others are the nominal ones.
         out: Folder for plan.json and plan.png.
     """
-    from foretrace.imagined.context import nominal_constants
     from foretrace.interactions.recording_folder import write_image
     from foretrace.planning import plan as choose
-    from foretrace.predictor import load_imaginer
 
     goal = aim.load()
     seen, thing, T_table_object = _observe(obj, photo, where)
@@ -167,11 +171,14 @@ def plan(
     for name, value in given.items():
         if not 0 < value < float("inf"):
             raise PlanningError(f"{_option(name)} is {value}: give a number above 0")
-    predictor = load_imaginer(run)
+    predictor = _imaginer(run, action, steps)
     told: Any = None
     if given or unknown:
-        usual = {} if unknown else dict(nominal_constants())
+        usual = {} if unknown else dict(predictor.nominal)
         told = {name: value for name, value in (usual | given).items() if name in predictor.context}
+    if steps != 1:
+        _plan_several(thing, goal, steps, predictor, told, search, where, out)
+        return
     found = choose(
         thing,
         goal,
@@ -192,6 +199,58 @@ def plan(
         write_image(out / "overlay.png", picture)
         written.append("overlay.png")
     print("\n".join(str(out / name) for name in written))
+
+
+def _imaginer(run: Path | None, action: ActionName, steps: int) -> "Imaginer":
+    """What imagines actions of a kind, to rest if there are several."""
+    if run is not None and (action == "push" or steps != 1):
+        raise PlanningError(f"{run} learned single lever-ups: leave it out, or --action push and --steps")
+    if action == "push":
+        from foretrace.twin.sliding import SlidingTwin
+
+        return SlidingTwin()
+    if steps != 1:
+        from foretrace.imagined import IMAGINERS
+
+        return IMAGINERS.find("twin-to-rest")(None)
+    from foretrace.predictor import load_imaginer
+
+    return load_imaginer(run)
+
+
+def _plan_several(
+    thing: "ObjectModel | TopDownView",
+    goal: goals.Goal,
+    steps: int,
+    imaginer: "Imaginer",
+    told: Any,
+    search: PlanConfig,
+    where: PlaceOptions,
+    out: Path,
+) -> None:
+    """Plan actions in a row; print and save them."""
+    from foretrace.planning.sequence import SIMULATED, plan_sequence
+
+    if where.base is not None:
+        raise PlanningError("--base goes with one action: leave it or --steps out")
+    simulated = imaginer.name == "twin" and search == PlanConfig()
+    found = plan_sequence(thing, goal, steps, imaginer, told, config=SIMULATED if simulated else search)
+    out.mkdir(parents=True, exist_ok=True)
+    if found.note:
+        say(f"note: {found.note}")
+    print(f"goal: {found.goal}")
+    for k, (action, T) in enumerate(zip(found.actions, found.frames[1:], strict=True), start=1):
+        (x, y), (dx, dy) = action.contact, action.direction
+        turn = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
+        print(
+            f"{action.label} {k}: contact x {100 * x:.2f}, y {100 * y:.2f} cm, direction {dx:.3f}, {dy:.3f}; then the "
+            f"object lies at x {100 * T[0, 3]:.2f}, y {100 * T[1, 3]:.2f} cm, turned by {turn:.1f} degrees"
+        )
+    print(f"reached with a probability of {found.reached:.1%}, cost {found.cost:.3f}")
+    found.save(out / "sequence.json")
+    found.plan.save(out / "plan.json")
+    draw_plan(found.plan, out / "plan.png")
+    print("\n".join(str(out / name) for name in ("sequence.json", "plan.json", "plan.png")))
 
 
 def say_plan(found: "Plan") -> None:
@@ -271,7 +330,7 @@ def _observe(
     return None, obj.load()[0], T
 
 
-def _reach(where: PlaceOptions, T_table_object: "np.ndarray | None") -> Any:
+def _reach(where: PlaceOptions, T_table_object: np.ndarray | None) -> Any:
     """What says whether the arm reaches a lever-up; None without an arm."""
     if where.base is None:
         return None

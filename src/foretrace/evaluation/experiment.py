@@ -41,6 +41,7 @@ SUMMARIES = {
     "other-world": "Few lever-ups of another world, learned alone or over a twin.",
     "non-flat": "Masks against height maps of objects that are not flat.",
     "planning": "Plans beside simple rules and an oracle that simulates all.",
+    "sequences": "Goals by several pushes or lever-ups, planned again or blind.",
     "uncertainty": "Calibration of probabilities, regions and samples.",
 }
 """Experiments that come with foretrace, each in a line; their modules are imported when they are looked up."""

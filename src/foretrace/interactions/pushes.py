@@ -1,6 +1,7 @@
 """Recorded planar pushes: a table of object poses and rod positions before and after, and a file of shapes."""
 
 import csv
+import json
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ import shapely
 from jaxtyping import Float, Int
 from msgspec import Meta
 
-from foretrace.actions import Push, PushPath, Rod
+from foretrace.actions import FAILED, Push, PushOutcome, PushPath, Rod
 from foretrace.errors import DatasetError, ShapeError, is_number, shown
 from foretrace.files import read_json
-from foretrace.geometry import rotate_plane, wrap_angle
+from foretrace.geometry import invert_transform, pose_to_matrix, rotate_plane, wrap_angle
+from foretrace.interactions.record import Interaction
 from foretrace.objects import NO_BEVEL, Prism
 from foretrace.schema import Positive, Vector2
 
@@ -142,6 +144,55 @@ class RecordedPushes:
         after = self.after if after is None else after
         moved = rotate_plane(after[:, :2] - self.before[:, :2], -self.before[:, 2])
         return np.column_stack([moved, wrap_angle(after[:, 2] - self.before[:, 2])])
+
+    @classmethod
+    def of(cls, interactions: Sequence[Interaction], surface: str = "") -> "RecordedPushes":
+        """Pushes that were carried out, simulated or recorded; objects that are equal are one shape.
+
+        Shapes are named ``object 0``, ``object 1`` and so on. Before each push, the table's frame is the object's.
+
+        Args:
+            interactions: Pushes with their effects, all with rods of one radius.
+            surface: Name of the table's surface.
+
+        Raises:
+            DatasetError: There is none, or one is no push that moved its object without tipping it.
+        """
+        names: dict[str, int] = {}
+        shapes: list[PushedShape] = []
+        numbers, after, rods = [], [], []
+        for each in interactions:
+            action, effect = each.action, each.effect
+            if not isinstance(action, Push) or effect.outcome in (FAILED, PushOutcome.TIPPED):
+                raise DatasetError(
+                    f"interaction {each.id} is a {action.label} that ended {shown(str(effect.outcome))}: give pushes "
+                    "that left their objects flat"
+                )
+            number = names.setdefault(json.dumps(each.object.to_dict()), len(names))
+            if number == len(shapes):
+                mass = each.object.mass_properties(each.physics.density).mass
+                shapes.append(
+                    PushedShape(
+                        f"object {number}", Prism(each.object.corners, each.object.height, NO_BEVEL), mass
+                    )
+                )
+            pose = pose_to_matrix(effect.pose_trajectory[[0, -1]])
+            moved = invert_transform(pose[0]) @ pose[1]
+            start = action.contact - (action.path.approach + action.tool.radius) * action.direction
+            numbers.append(number)
+            after.append([*moved[:2, 3], np.arctan2(moved[1, 0], moved[0, 0])])
+            rods.append([start, start + action.path.length * action.direction])
+        radii = {each.action.tool.radius for each in interactions}  # pyright: ignore[reportAttributeAccessIssue]
+        if len(radii) != 1:
+            raise DatasetError(
+                f"the rods of the pushes have the radii {shown(sorted(radii))} m: give pushes with one rod"
+            )
+        count = len(numbers)
+        speed = np.array([each.action.path.speed for each in interactions])
+        return cls(
+            tuple(shapes), np.array(numbers), (surface,) * count, speed, np.zeros((count, 3)), np.array(after),
+            np.array(rods), {}, np.arange(count), radii.pop(),
+        )  # fmt: skip
 
     def action(self, row: int) -> Push | None:
         """The push of a row, placed on its object; None where the rod passes the object without touching it."""

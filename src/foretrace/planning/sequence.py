@@ -20,6 +20,7 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
 from foretrace.planning.goals import Goal, as_goal, describe
+from foretrace.planning.goals.base import LEVERED
 from foretrace.planning.motions import Motions
 from foretrace.planning.plan import PlanConfig
 from foretrace.planning.result import Plan
@@ -35,7 +36,8 @@ SAMPLES = 6
 """Samples of each motion that goals look at in a sequence."""
 STEP_COST = 0.02
 """A further action has to lower the cost by more than this: 2 mm."""
-USUAL = PlanConfig()
+SIMULATED = PlanConfig(spacing=0.02, directions=1, refine=0)
+"""How candidates are searched where each takes a simulation."""
 SURE = 0.5
 """A goal counts as reached from this probability on."""
 
@@ -140,7 +142,7 @@ def plan_sequence(
     imaginer: Imaginer | None = None,
     context: Context | Belief = None,
     *,
-    config: PlanConfig = USUAL,
+    config: PlanConfig | None = None,
     com: Numbers | None = None,
 ) -> Sequence:
     """Plan up to so many actions in a row, so that the goal is reached after the last.
@@ -156,14 +158,16 @@ def plan_sequence(
         imaginer: Imagines actions until the object rests: `SlidingTwin` for pushes, `TwinImaginer` with ``set_down``
             for lever-ups, which is taken by default.
         context: What it is told.
-        config: How candidates are searched; nothing is checked by a second imaginer.
+        config: How candidates are searched; nothing is checked by a second imaginer. By default as in `foretrace.plan`,
+            without an imaginer at contacts every 2 cm along the normal.
         com: Centre of mass at rest in the object's frame [m]; by default the object's own, or estimated from the view.
 
     Raises:
         PlanningError: As `foretrace.plan`; or the imaginer does not tell how an object comes to rest, or the goal is
             reached already.
     """
-    aim, scene = _begin(seen, goal, steps, config, com)
+    config = _config(config, imaginer)
+    aim, scene = _begin(seen, goal, steps, com)
     own = _resting(imaginer, scene)
     if _state(aim, scene, _com_of(scene), np.eye(4))[1]:
         raise PlanningError(f"the goal {describe(aim)} is reached already: give another one")
@@ -177,7 +181,7 @@ def execute_sequence(
     imaginer: Imaginer | None = None,
     context: Context | Belief = None,
     *,
-    config: PlanConfig = USUAL,
+    config: PlanConfig | None = None,
     replan: bool = True,
 ) -> Execution:
     """Act, observe and plan again until the goal is reached, or so many actions are carried out.
@@ -188,7 +192,7 @@ def execute_sequence(
         steps: Actions, at most.
         imaginer: As of `plan_sequence`.
         context: What it is told.
-        config: How candidates are searched.
+        config: As of `plan_sequence`.
         replan: Plan again after each action; otherwise the first sequence is carried out as it was planned, where
             the object is expected.
 
@@ -198,7 +202,8 @@ def execute_sequence(
     """
     check_type("world", world, World, PlanningError, "a World: observe, locate, act")
     seen, T_table_start = world.observe(), world.locate()
-    aim, scene = _begin(seen, goal, steps, config, None)
+    config = _config(config, imaginer)
+    aim, scene = _begin(seen, goal, steps, None)
     own = _resting(imaginer, scene)
     T_start_table, com = invert_transform(T_table_start), _com_of(scene)
     frames, actions, outcomes, sequences = [np.eye(4)], [], [], []
@@ -232,18 +237,27 @@ def execute_sequence(
     )
 
 
-def _begin(seen: Any, goal: Any, steps: int, config: PlanConfig, com: Numbers | None) -> tuple[Goal, Scene]:
+def _begin(seen: Any, goal: Any, steps: int, com: Numbers | None) -> tuple[Goal, Scene]:
     """The goal and the scene, checked."""
-    check_type("config", config, PlanConfig, PlanningError)
     if not is_whole(steps, 1, MOST_STEPS):
         raise fault(PlanningError, isinstance(steps, int))(
             f"steps is {shown(steps)}: give a whole number from 1 to {MOST_STEPS}"
         )
     aim, scene = as_goal(goal), Scene.of(seen)
     aim.check(scene.outline)
+    if LEVERED in aim.needed_outcomes():
+        raise PlanningError(
+            f"the goal {describe(aim)} is about an object that is {LEVERED}, a sequence ends with the object at rest: "
+            "give a goal about where it lies, or plan a single action"
+        )
     if com is not None:
         scene = scene.loaded(finite_array("com (x, y, z) [m]", com, (3,), PlanningError))
     return aim, scene
+
+
+def _config(config: PlanConfig | None, imaginer: Imaginer | None) -> PlanConfig:
+    check_type("config", config, (PlanConfig, type(None)), PlanningError)
+    return config or (SIMULATED if imaginer is None else PlanConfig())
 
 
 def _resting(imaginer: Imaginer | None, scene: Scene) -> Imaginer:
@@ -273,7 +287,7 @@ def _plan(
     around, scores = search.look_around()
     pool, scores = search.refine(around, scores) if config.refine else (around, scores)
     start = np.eye(4) if scene.T_start_now is None else scene.T_start_now
-    rows = np.zeros(0, dtype=np.int64)
+    rows, cost, reached = np.zeros(0, dtype=np.int64), np.inf, 0.0
     if steps > 1 and scores.reached[scores.order()[0]] < SURE:
         rows, cost, reached = _compose(search, start, _com_of(scene), steps)
     if len(rows) < 2:

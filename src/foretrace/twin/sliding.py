@@ -17,7 +17,7 @@ from foretrace.geometry import invert_transform, rotate_plane
 from foretrace.imagined import ImaginedBatch, Imaginer, Scenes
 from foretrace.imagined.context import EXACT
 from foretrace.interactions.batch import Candidates
-from foretrace.interactions.pushes import PushedShape, RecordedPushes
+from foretrace.interactions.pushes import RecordedPushes
 from foretrace.objects import ObjectModel
 from foretrace.objects.footed import feet_of
 from foretrace.simulation.randomisation import RANDOMISED
@@ -98,6 +98,8 @@ class SlidingTwin(Imaginer):
     """Worlds in which a push is played of which something is not told."""
     duration: float = 6.0
     """Time that is imagined [s]; pushes must not take longer."""
+    steps: int = STEPS
+    """Steps into which an imagined push is cut."""
     seed: int = 0
     """Decides what is drawn."""
 
@@ -243,7 +245,7 @@ class SlidingTwin(Imaginer):
             (length * direction).reshape(-1, 2),
             np.repeat([push.tool.radius for push in pushes], worlds),
         )
-        found, outcome = flat.play(STEPS)
+        found, outcome = flat.play(self.steps)
         states = states_over_time(
             found,
             [push for push in pushes for _ in range(worlds)],
@@ -280,7 +282,7 @@ class SlidingTwin(Imaginer):
         """Displacement [m] and turn [rad] of each object, in its own frame at rest."""
         found = np.zeros((len(pushes), 3))
         for group, rows in groups_of(pushes).items():
-            found[rows] = _play(pushes[rows], self.own.get(group, self.shared), change)
+            found[rows] = _play(pushes[rows], self.own.get(group, self.shared)[None], change)[0]
         return found
 
     @classmethod
@@ -323,25 +325,30 @@ def groups_of(pushes: RecordedPushes) -> dict[Group, np.ndarray]:
     return {key: np.array(rows) for key, rows in found.items()}
 
 
-def _play(pushes: RecordedPushes, values: Float[np.ndarray, " names"], change: Change) -> np.ndarray:
-    """Displacements and turns of pushes of one shape."""
-    shape = pushes.shapes[pushes.shape[0]]
-    footprint = _footprint(shape, values, change.spread)
-    rod = rotate_plane(np.broadcast_to(1e-3 * values[7:9], (len(pushes), 2)), -pushes.before[:, 2])
-    motion = rotate_plane(pushes.motion, np.full(len(pushes), change.turn))
-    left = np.stack([-motion[:, 1], motion[:, 0]], axis=1) / np.linalg.norm(motion, axis=1)[:, None]
-    friction = FRICTION * np.exp(values[0]) * change.friction
-    start = pushes.start + rod + change.left * left
-    position, angle = slide(footprint, start, motion, pushes.radius, friction, STEPS)
-    return np.column_stack([position, angle])
-
-
-def _footprint(shape: PushedShape, values: Float[np.ndarray, " names"], spread: float) -> Footprint:
-    """A shape with its weight spread as given."""
-    offset = 1e-3 * values[5:7]
+def _play(
+    pushes: RecordedPushes, values: Float[np.ndarray, "variants names"], change: Change = Change()
+) -> Float[np.ndarray, "variants pushes 3"]:
+    """Displacements and turns of pushes of one shape, by several sets of constants."""
+    shape, variants, count = pushes.shapes[pushes.shape[0]], len(values), len(pushes)
+    offset = 1e-3 * values[:, None, 5:7]
     feet = feet_of(shape.model.corners, "uniform")
-    around = (feet - feet.mean(axis=0)) * np.exp(values[1:3]) * spread
-    return Footprint(shape.model.corners + offset, shape.centroid + offset + 1e-2 * values[3:5] + around)
+    around = (feet - feet.mean(axis=0)) * np.exp(values[:, None, 1:3]) * change.spread
+    feet = shape.centroid + 1e-2 * values[:, None, 3:5] + around  # in the frame of the outline
+    turn = np.tile(-pushes.before[:, 2], variants)
+    rod = rotate_plane(np.repeat(1e-3 * values[:, 7:9], count, axis=0), turn).reshape(variants, count, 2)
+    motion = rotate_plane(pushes.motion, np.full(count, change.turn))
+    left = np.stack([-motion[:, 1], motion[:, 0]], axis=1) / np.linalg.norm(motion, axis=1)[:, None]
+    position, angle = slide(
+        Footprint(shape.model.corners, np.repeat(feet, count, axis=0)),
+        (pushes.start + rod + change.left * left - offset).reshape(-1, 2),
+        np.tile(motion, (variants, 1)),
+        pushes.radius,
+        np.repeat(FRICTION * np.exp(values[:, 0]) * change.friction, count),
+        STEPS,
+    )
+    origin = np.repeat(offset[:, 0], count, axis=0)
+    moved = position + origin - rotate_plane(origin, angle)
+    return np.column_stack([moved, angle]).reshape(variants, count, 3)
 
 
 def _fit(
@@ -363,15 +370,18 @@ def _fit(
         return values
 
     def residuals(values: np.ndarray) -> np.ndarray:
-        return ((SlidingTwin(whole(values)).predict(pushes) - truth) / SCALE).ravel()
+        """One row for each set of constants."""
+        found = np.zeros((len(values), len(pushes), 3))
+        for rows in groups.values():
+            found[:, rows] = _play(pushes[rows], np.array([whole(each) for each in values]))
+        return ((found - truth) / SCALE).reshape(len(values), -1)
 
-    truth = pushes.displacement()
+    truth, groups = pushes.displacement(), groups_of(pushes)
     values, damping = mean.copy(), 1e-2
     covariance = np.diag(std**2)
     for _ in range(ITERATIONS):
-        errors = residuals(values)
-        steps = STEP * np.eye(len(NAMES))
-        slopes = np.stack([(residuals(values + steps[k]) - errors) / STEP[k] for k in free], axis=1)
+        errors, *stepped = residuals(np.stack([values, *(values + np.diag(STEP)[free])]))
+        slopes = ((np.array(stepped) - errors) / STEP[free, None]).T
         # Student's t with two degrees of freedom: a push that went another way counts little.
         weights = 3 / (2 + errors**2)
         best = _cost(errors, values, mean, std, free)
@@ -382,7 +392,7 @@ def _fit(
         for _ in range(3):
             trial = values.copy()
             trial[free] -= np.linalg.solve(square + damping * np.diag(np.diag(square)), right)
-            if _cost(residuals(trial), trial, mean, std, free) < best:
+            if _cost(residuals(trial[None])[0], trial, mean, std, free) < best:
                 values, damping = trial, damping / 3
                 break
             damping *= 10
