@@ -96,6 +96,7 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "shipped": lambda root: {"objects": 2, "twin": True},
     "pushes": lambda root: dict(zip(("pushes", "shapes"), factories.write_push_table(root, 90), strict=True))
                            | {"methods": ("nearest", "simulation", "learned")},
+    "sequences": lambda root: {"pushed": 1, "levered": 0, "few": 2},
     "planning": lambda root: {"objects": 1, "families": ("polygon",), "worlds": ("nominal",), "contacts": 16},
     "uncertainty": lambda root: {"data": root / "plain", "seeds": (0,), "splits": ("shuffled",), "samples": 3,
                                  "recipe": QUICK["one-shot"]},

@@ -1,5 +1,7 @@
 """An object on a table in simulation: actions are carried out on it, one after the other, until it rests."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import shapely
 from jaxtyping import Float
@@ -14,6 +16,23 @@ from foretrace.simulation.lever_up import SimulationConfig, effect_of
 USUAL = SimulationConfig(embodiment="tool")
 LEANING = 0.995
 """An object whose own z axis has a smaller vertical part lies on another side."""
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """What one action did, on the table."""
+
+    times: Float[np.ndarray, " time"]
+    """Time since the start of the action [s]."""
+    object_frame: Float[np.ndarray, "time 4 4"]
+    """The object's frame."""
+    tool: Float[np.ndarray, "time 2"]
+    """Place of the tool's tip from above [m]."""
+
+    @property
+    def period(self) -> float:
+        """Time between samples [s]."""
+        return float(self.times[1] - self.times[0])
 
 
 class SimulatedWorld:
@@ -39,6 +58,8 @@ class SimulatedWorld:
         self.object, self.config = obj, config
         self.T_table_object = np.eye(4)
         """The object's frame on the table."""
+        self.played: list[Played] = []
+        """What each action did that moved the tool."""
         self._seen = obj if seen is None else seen
 
     def observe(self) -> ObjectModel:
@@ -76,9 +97,10 @@ class SimulatedWorld:
         )
         effect = effect_of(motion, self.object, action, config.physics, to_rest=True)
         if effect.outcome != FAILED:
-            self.T_table_object = _flat(
-                invert_transform(T_action_table) @ pose_to_matrix(effect.pose_trajectory[-1])
-            )
+            poses = invert_transform(T_action_table) @ pose_to_matrix(effect.pose_trajectory)
+            tool = invert_transform(T_action_table) @ pose_to_matrix(effect.tool_trajectory)
+            self.played.append(Played(effect.times, poses, tool[:, :2, 3]))
+            self.T_table_object = _flat(poses[-1])
         return str(effect.outcome)
 
     def _blocked(self, action: Action, pose: Float[np.ndarray, "4 4"]) -> bool:
