@@ -116,3 +116,32 @@ def _after_reset():
     made = environment.LeverUpEnv()
     made.reset(seed=0)
     return made
+
+
+def test_imagined_costs_are_minus_the_rewards_that_are_expected():
+    made, cost = environment.LeverUpEnv(), environment.ImaginedCost()
+    seen, _ = made.reset(seed=0, options={"object": BOX})
+    actions = np.random.default_rng(0).uniform(-1, 1, (1, 24, 1, 2)).astype(np.float32)
+    found = cost.get_cost({name: values[None, None] for name, values in seen.items()}, actions)
+    assert found.shape == (1, 24)
+    best, worst = found[0].argmin(), found[0].argmax()
+    rewards = [made.step(actions[0, k, 0])[1] for k in (best, worst)]
+    assert rewards[0] > rewards[1]
+    assert -found[0, best] == pytest.approx(rewards[0], abs=0.15)
+    torch = pytest.importorskip("torch")
+    tensors = {name: torch.as_tensor(values)[None] for name, values in seen.items()}
+    again = cost.get_cost(tensors, torch.as_tensor(actions[:, :, 0]))
+    assert isinstance(again, torch.Tensor)
+    np.testing.assert_allclose(again.numpy(), found, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "views", "wanted"),
+    [((1, 4, 2, 2), 1, "an episode has one action"), ((2, 4, 1, 2), 1, "not that of 2 environments")],
+)
+def test_costs_of_something_else_are_refused(shape, views, wanted):
+    made = environment.LeverUpEnv()
+    seen, _ = made.reset(seed=0, options={"object": BOX})
+    info = {name: np.stack([values] * views) for name, values in seen.items()}
+    with pytest.raises(PlanningError, match=wanted):
+        environment.ImaginedCost().get_cost(info, np.zeros(shape))

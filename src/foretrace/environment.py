@@ -3,7 +3,7 @@
 Importing this module registers ``foretrace/LeverUp-v1``; where the package is installed, Gymnasium does so itself.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from foretrace.actions import LeverUp, ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import ForetraceError, PlanningError, check_type, fault
 from foretrace.geometry import inward_normals
-from foretrace.imagined import Futures, ImaginedBatch
+from foretrace.imagined import Futures, ImaginedBatch, Imaginer
 from foretrace.imagined.context import CONSTANTS, nominal_constants
 from foretrace.imagined.observed import rotations_since_rest
 from foretrace.interactions.record import Effect, Physics
@@ -27,6 +27,8 @@ from foretrace.objects import ObjectModel, sample_prism
 from foretrace.planning import Motions, Plan, goals
 from foretrace.planning.candidates import LOOK_AHEAD, Candidates, Scene, find_free
 from foretrace.planning.goals import Goal, as_goal
+from foretrace.planning.scores import score
+from foretrace.predictor import load_imaginer
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.randomisation import RANDOMISED
 
@@ -157,22 +159,13 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
 
     def lever_up(self, action: np.ndarray) -> LeverUp:
         """The lever-up that an action means, in the view's frame."""
-        values = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
+        values = np.asarray(action, dtype=float)
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise PlanningError(
                 f"the action has the shape {values.shape}: give {self.action_space.shape} finite numbers"
             )
-        _, _, scene, _ = self._drawn or (None, None, None, None)
-        assert scene is not None
-        contact, normal = _towards(scene.outline, np.pi * values[0])
-        c, s = np.cos(CONE * values[1]), np.sin(CONE * values[1])
-        direction = np.array([c * normal[0] - s * normal[1], s * normal[0] + c * normal[1]])
-        shares = (values[2:] + 1) / 2
-        settings = {
-            name: float(low + share * (high - low))
-            for share, (name, (low, high)) in zip(shares, VARIED_ACTION.items(), strict=False)
-        }
-        return LeverUp(contact, direction, ToolPath.of(**settings) if settings else ToolPath())
+        assert self._drawn is not None
+        return _lever_up(self._drawn[2].outline, values)
 
     def action_of(self, plan: Plan) -> np.ndarray:
         """The action that comes nearest to a plan that was made from the observed view."""
@@ -240,6 +233,82 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
         }
 
 
+class ImaginedCost:
+    """What actions in the environment are expected to cost, without trying them.
+
+    For planners that ask a world model, such as the solvers of stable-worldmodel: they call `get_cost`.
+
+    Args:
+        goal: The environment's goal; by default, to lift.
+        imaginer: Imagines the lever-ups; by default the predictor that comes with the package.
+    """
+
+    def __init__(
+        self, goal: Goal | Callable[..., Any] | None = None, imaginer: Imaginer | None = None
+    ) -> None:
+        self.goal = goals.Lift() if goal is None else as_goal(goal)
+        self.imaginer = load_imaginer() if imaginer is None else imaginer
+
+    def get_cost(self, info: Mapping[str, Any], candidates: Any) -> Any:
+        """Minus the expected reward of each candidate.
+
+        Args:
+            info: Observations, one for each environment, arrays or tensors: ``mask`` and ``height``,
+                (B, ..., 128, 128), and ``context``, (B, ..., 3). Of several in a row, the last counts.
+            candidates: Actions, an array or a tensor (B, S, 1, A) or (B, S, A), S for each environment.
+
+        Returns:
+            Costs (B, S), of the type of the candidates.
+
+        Raises:
+            PlanningError: Shapes that do not fit, or numbers that are not finite.
+        """
+        actions = np.asarray(candidates, dtype=float)
+        sizes = (2, 2 + len(VARIED_ACTION))
+        if (
+            actions.ndim not in (3, 4)
+            or actions.shape[-1] not in sizes
+            or actions.shape[2:-1] not in ((), (1,))
+        ):
+            raise PlanningError(
+                f"candidates have the shape {actions.shape}: give (B, S, 1, A) with A = {sizes[0]} or {sizes[1]}; an "
+                "episode has one action"
+            )
+        if not np.isfinite(actions).all():
+            raise PlanningError("candidates are not all finite: give numbers from -1 to 1")
+        count, actions = len(actions), actions.reshape(*actions.shape[:2], -1)
+        try:
+            seen = {name: np.asarray(info[name]) for name in ("mask", "height", "context")}
+            last = {
+                name: seen[name].reshape(count, -1, VIEW_SIZE, VIEW_SIZE)[:, -1]
+                for name in ("mask", "height")
+            }
+            last["context"] = seen["context"].reshape(count, -1, len(TOLD))[:, -1]
+        except (KeyError, ValueError) as error:
+            raise PlanningError(
+                f"info is not that of {count} environments: give mask, height and context as they are observed"
+            ) from error
+        costs = np.stack(
+            [self._costs({name: last[name][row] for name in last}, actions[row]) for row in range(count)]
+        )
+        return candidates.new_tensor(costs) if hasattr(candidates, "new_tensor") else costs
+
+    def _costs(
+        self, observation: dict[str, np.ndarray], actions: Float[np.ndarray, "samples action"]
+    ) -> Float[np.ndarray, " samples"]:
+        scene = Scene.of(observed_view(observation))
+        levers = tuple(_lever_up(scene.outline, values) for values in actions)
+        nowhere = np.zeros(len(levers))
+        free = np.flatnonzero(find_free(scene, Candidates(nowhere, nowhere, levers))[0])
+        costs = np.full(len(levers), -REFUSED)
+        if len(free):
+            some = [levers[k] for k in free]
+            batch = self.imaginer.imagine_candidates(scene.view, some, context=observed_context(observation))
+            scores = score(self.goal, Motions.of(batch, some, scene.outline, scene.height), "expected", 1.0)
+            costs[free] = scores.cost + BROKEN * scores.chances.sum(axis=1)
+        return costs
+
+
 def observed_view(observation: dict[str, np.ndarray]) -> TopDownView:
     """The view in an observation, as imaginers and planners take it."""
     return TopDownView(observation["mask"].astype(bool), observation["height"])
@@ -260,6 +329,20 @@ def register_environments() -> None:
 
 def _draw_prism(rng: np.random.Generator) -> ObjectModel:
     return sample_prism(rng, int(rng.integers(3, 11)))
+
+
+def _lever_up(outline: Float[np.ndarray, "corners 2"], values: Float[np.ndarray, " action"]) -> LeverUp:
+    """The lever-up that an action means."""
+    values = np.clip(values, -1.0, 1.0)
+    contact, normal = _towards(outline, np.pi * values[0])
+    c, s = np.cos(CONE * values[1]), np.sin(CONE * values[1])
+    direction = np.array([c * normal[0] - s * normal[1], s * normal[0] + c * normal[1]])
+    shares = (values[2:] + 1) / 2
+    settings = {
+        name: float(low + share * (high - low))
+        for share, (name, (low, high)) in zip(shares, VARIED_ACTION.items(), strict=False)
+    }
+    return LeverUp(contact, direction, ToolPath.of(**settings) if settings else ToolPath())
 
 
 def _middle(outline: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "2"]:
