@@ -1,10 +1,14 @@
 """The examples run as they stand, say something sensible, and stay short."""
 
+import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,3 +145,46 @@ def test_own_action(tmp_path: Path) -> None:
     moved = re.findall(r"nudged, ([\d.]+) cm in MuJoCo, ([\d.]+) in Bullet; same again: True", printed)
     assert len(moved) == 3
     assert all(abs(float(mujoco) - float(bullet)) < 1 for mujoco, bullet in moved)
+
+
+def test_the_ros_node_predicts_and_watches(monkeypatch) -> None:
+    """ROS is not installed here: stand-ins for its modules take the messages."""
+    sent: dict[str, list[str]] = {}
+
+    class Node:
+        def __init__(self, name: str) -> None:
+            self.subscribed: dict[str, Any] = {}
+
+        def create_publisher(self, kind: Any, topic: str, depth: int) -> Any:
+            return SimpleNamespace(publish=lambda message: sent.setdefault(topic, []).append(message.data))
+
+        def create_subscription(self, kind: Any, topic: str, work: Any, depth: int) -> None:
+            self.subscribed[topic] = work
+
+        def get_logger(self) -> Any:
+            return SimpleNamespace(error=sent.setdefault("errors", []).append)
+
+    for name, content in {
+        "rclpy": {},
+        "rclpy.node": {"Node": Node},
+        "geometry_msgs.msg": {"PoseStamped": object},
+        "std_msgs.msg": {"String": SimpleNamespace},
+    }.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
+    node = runpy.run_path(str(EXAMPLES / "ros2_node.py"))["ForetraceNode"]()
+    predict, watch = (node.subscribed[f"foretrace/{name}"] for name in ("predict", "object_pose"))
+    prism = {
+        "kind": "prism",
+        "corners": [[0.09, 0], [0.02, 0.08], [-0.07, 0.05], [-0.08, -0.04], [0.03, -0.08]],
+    }
+    predict(SimpleNamespace(data=json.dumps({"object": prism, "action": {"contact": [0, 0.08]}})))
+    assert json.loads(sent["foretrace/imagined"][0])["outcomes"]["levered"] > 0
+    for k in range(3):
+        stamp = SimpleNamespace(sec=100, nanosec=50_000_000 * k)
+        place, turn = SimpleNamespace(x=0.1, y=0.0, z=0.0), SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0)
+        pose = SimpleNamespace(position=place, orientation=turn)
+        watch(SimpleNamespace(header=SimpleNamespace(stamp=stamp), pose=pose))
+    assert [json.loads(each)["alarm"] for each in sent["foretrace/verdict"]] == [False] * 3
+    assert json.loads(sent["foretrace/verdict"][2])["time"] == pytest.approx(0.1)
+    predict(SimpleNamespace(data="{}"))
+    assert "object" in sent["errors"][0]

@@ -2,6 +2,7 @@
 
 import io
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from foretrace.geometry import transform_points
 from foretrace.predictor import load_imaginer
 from foretrace.studio import saving
 from foretrace.studio.choices import Choices, link_of
-from foretrace.studio.controls import verdict_html
+from foretrace.studio.controls import learned_html, verdict_html
 from foretrace.studio.scenery import edges_of, futures_of, observed_motion, rim_segments, shown_times, tube
 from foretrace.studio.session import LEVEL, Session
 from foretrace.studio.shapes import EXAMPLES, example, from_file, from_text, prism_of
@@ -186,6 +187,31 @@ def test_a_monitor_watches_what_goes_wrong(wish):
     assert ("alarm at" in shown) == (watched.alarm is not None)
     session.change(along=0.4)
     assert session.watched is None
+
+
+def test_three_lever_ups_narrow_what_is_believed():
+    truth, beliefs = Session(seed=2).learn()
+    assert set(truth) == {"friction", "tool_friction", "density"}
+    prior, last = ft.Belief(), beliefs[-1]
+    assert len(beliefs) == 3
+    assert last.std["tool_friction"] < 0.6 * prior.std["tool_friction"]
+    assert abs(last.mean["tool_friction"] - truth["tool_friction"]) < 3 * last.std["tool_friction"]
+    shown = learned_html(truth, beliefs)
+    assert "after 3" in shown
+    assert shown.count("±") == 12
+
+
+def test_a_row_of_a_data_set_is_replayed():
+    prism = EXAMPLES["bracket"]
+    recorded = ft.simulate(prism, ft.LeverUp.at_edge(prism, 1), embodiment="tool")
+    session = Session()
+    watched = session.replay(recorded)
+    np.testing.assert_allclose(session.action.contact, recorded.action.contact, atol=1e-9)
+    np.testing.assert_array_equal(watched.poses, recorded.effect.pose_trajectory)
+    assert watched.truth == f"{recorded.effect.outcome}, as the data set has it"
+    assert len(watched.verdicts) == len(recorded.effect.times)
+    with pytest.raises(ForetraceError, match="the row is no lever-up"):
+        session.replay(replace(recorded, action=ft.Push((0.0, 0.0), (1.0, 0.0))))
 
 
 @pytest.mark.parametrize(

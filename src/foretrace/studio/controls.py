@@ -1,13 +1,13 @@
 """The panel of a visitor's page, in viser: buttons and sliders, made from the choices and their limits."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, get_args
 
 import numpy as np
 
-from foretrace.imagined import ImaginedEffect
+from foretrace.imagined import Belief, ImaginedEffect
 from foretrace.pictures.style import GREY, OUTCOME_COLORS, PREDICTION_COLORS
 from foretrace.studio.choices import LIMITS, PHYSICS, Choices, GoalName
 from foretrace.studio.session import LEVEL
@@ -195,7 +195,9 @@ class Controls:
                 "choose a file", hint="PNG, STL, OBJ, PLY, OFF, CSV, TXT, JSON."
             )
         self.row = gui.add_number("row of the data set", 0, min=0, step=1, visible=data)
-        self.use_row = gui.add_button("use this row", visible=data)
+        self.use_row = gui.add_button(
+            "use this row", visible=data, hint="Its object and lever-up; what was recorded of it is green."
+        )
 
     def _add_goal(self, choices: Choices) -> None:
         gui = self._gui
@@ -213,11 +215,16 @@ class Controls:
         self.wish = gui.add_dropdown("what goes wrong", WISHES, initial_value=SURPRISE)
         self.watch = gui.add_button("watch", color="green")
         self.verdict = gui.add_html("")
+        self.learn = gui.add_button(
+            "three lever-ups", hint="What three simulated lever-ups tell of friction and density."
+        )
+        self.learned = gui.add_html("")
 
     def _add_save(self) -> None:
         gui = self._gui
         self.save_picture = gui.add_button("picture (PNG)")
         self.save_animation = gui.add_button("animation (GIF)")
+        self.save_video = gui.add_button("animation (MP4)")
         self.save_plan = gui.add_button("plan.json")
         self.save_lines = gui.add_button("the same in Python")
         self.link = gui.add_text("link", "", hint="Opens this page with these choices.")
@@ -270,6 +277,25 @@ def result_html(imagined: ImaginedEffect | None, message: str = "") -> str:
     if message:
         rows.append(_note(message))
     return f'<div style="padding:0.4em 1em 0.2em;font-size:0.82em">{"".join(rows)}</div>'
+
+
+def learned_html(truth: Mapping[str, float], beliefs: Sequence[Belief]) -> str:
+    """What is believed of each constant before and after lever-ups, and what it is, in HTML."""
+    before = Belief()
+    heads = ["", "before", *(f"after {k}" for k in range(1, len(beliefs) + 1)), "truth"]
+    rows = [
+        [
+            name.replace("_", " "),
+            *(f"{b.mean[name]:.3g} ± {b.std[name]:.2g}" for b in (before, *beliefs)),
+            f"{value:.3g}",
+        ]
+        for name, value in truth.items()
+    ]
+    cells = [
+        "".join(f"<td style='padding:0 0.35em'>{escape(cell)}</td>" for cell in row) for row in (heads, *rows)
+    ]
+    lines = "".join(f"<tr>{each}</tr>" for each in cells)
+    return f'<table style="font-size:0.75em;line-height:1.6;margin:0.4em">{lines}</table>'
 
 
 def _note(text: str) -> str:

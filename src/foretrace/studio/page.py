@@ -15,7 +15,7 @@ from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
 from foretrace.planning import Plan
 from foretrace.studio.choices import LARGEST_TURN, Choices, link_of
-from foretrace.studio.controls import OWN, Controls
+from foretrace.studio.controls import OWN, Controls, learned_html
 from foretrace.studio.saving import animation, picture, plan_file, python_lines
 from foretrace.studio.scenery import Moving, futures_of, observed_motion, shown_times
 from foretrace.studio.session import LEVEL, Session
@@ -118,9 +118,15 @@ class Page:
         _on(controls.alternatives, lambda: self.act(self._look_at))
         _on(controls.simulate, lambda: self.act(self._simulate))
         _on(controls.watch, lambda: self.act(self._watch))
+        _on(controls.learn, lambda: self.act(self._learn))
         for handle, name, make in (
             (controls.save_picture, "foretrace.png", lambda: picture(self.session, self._truth)),
             (controls.save_animation, "foretrace.gif", lambda: animation(self.session, self._truth)),
+            (
+                controls.save_video,
+                "foretrace.mp4",
+                lambda: animation(self.session, self._truth, ".mp4"),
+            ),
             (controls.save_plan, "plan.json", lambda: plan_file(self.session.plan)),
             (controls.save_lines, "foretrace_lines.py", lambda: python_lines(self.session).encode()),
         ):
@@ -160,6 +166,7 @@ class Page:
         if self._drawn is not None:
             self._draw_outline(False)
         self.session.change(object=obj, along=0.1, turn=0.0)
+        self.controls.learned.content = ""
         self.stage.show_object(obj)
         middle = obj.corners.mean(axis=0)
         self._client.camera.look_at = (*middle.tolist(), 0.03)
@@ -182,7 +189,8 @@ class Page:
             return
         interaction = self._data.with_id(int(self.controls.row.value))
         self._take(checked(interaction.object))
-        self.session.take(interaction.action)  # pyright: ignore[reportArgumentType]
+        self.session.replay(interaction)
+        self._begin_time()
 
     def _height(self) -> float:
         return 0.001 * float(self.controls.height.value)
@@ -252,9 +260,15 @@ class Page:
 
     def _watch(self) -> None:
         self.session.watch(self.controls.wish.value)
+        self._begin_time()
+
+    def _begin_time(self) -> None:
         self.controls.play.value = True
         self.controls.time.value = 0.0
         self._told = -1
+
+    def _learn(self) -> None:
+        self.controls.learned.content = learned_html(*self.session.learn())
 
     def _save(self, name: str, make: Callable[[], bytes]) -> None:
         self._client.send_file_download(name, make())

@@ -31,14 +31,14 @@ def picture(session: Session, truth: Interaction | None = None) -> bytes:
     return written.getvalue()
 
 
-def animation(session: Session, truth: Interaction | None = None) -> bytes:
-    """The same as a GIF.
+def animation(session: Session, truth: Interaction | None = None, ending: str = ".gif") -> bytes:
+    """The same as a GIF or, with the ending ``.mp4``, as a video.
 
     Raises:
         ForetraceError: Nothing can be imagined.
     """
     with TemporaryDirectory(prefix="foretrace-") as folder:
-        return scene_animation(_scene(session, truth), Path(folder) / "studio.gif").read_bytes()
+        return scene_animation(_scene(session, truth), Path(folder) / f"studio{ending}").read_bytes()
 
 
 def plan_file(plan: Plan | None) -> bytes:

@@ -175,7 +175,7 @@ def _add_predictions(app: FastAPI) -> None:
     def predict(body: PredictBody) -> Response:
         """Futures with their probabilities, in the action frame: origin at the contact, x along the action, z up."""
         obj = body.object.make()
-        imagined = _imagine(obj, body.action, body.context)
+        imagined = imagine(obj, body.action, body.context)
         return _json({"times": imagined.times.tolist(), **imagined.to_dict(body.level, body.most_futures)})
 
     @app.post(
@@ -212,7 +212,7 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
         """A monitor of one execution; give it every tracked sample."""
         obj = body.object.make()
         belief = Belief(worlds=max(body.worlds, 2)) if body.worlds else None
-        imagined = _imagine(obj, body.action, body.context if belief is None else belief)
+        imagined = imagine(obj, body.action, body.context if belief is None else belief)
         monitor = Monitor(
             imagined,
             body.false_alarms,
@@ -249,8 +249,17 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
         watches.end(id)
 
 
-def _imagine(obj: ObjectModel, place: ActionBody, context: Any) -> ImaginedEffect:
-    """What is imagined of a lever-up in a context, or over a belief."""
+def imagine(obj: ObjectModel, place: ActionBody, context: Any) -> ImaginedEffect:
+    """What is imagined of a lever-up in a context, or over a belief.
+
+    Args:
+        obj: The object.
+        place: Where and how it is levered.
+        context: As of `foretrace.imagined.Imaginer.imagine`.
+
+    Raises:
+        ForetraceError: The object or the lever-up cannot be imagined.
+    """
     action = place.make(obj)
     com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
     return learned().imagine(TopDownView.of(obj, action), action, context=context, com=com)

@@ -15,12 +15,13 @@ from foretrace.imagined import IMAGINERS, Belief, ImaginedEffect, Imaginer, conf
 from foretrace.imagined.belief import EXECUTION
 from foretrace.interactions.record import ExecutionOffset, Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
+from foretrace.monitoring import identify
 from foretrace.objects import Prism
 from foretrace.planning import Plan, PlanConfig, RimCost, plan
 from foretrace.planning.candidates import Rim, place
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.studio.choices import LARGEST_TURN, PHYSICS, Choices
-from foretrace.studio.watching import SURPRISE, Watched, watch
+from foretrace.studio.watching import SURPRISE, Watched, watch, watch_again
 from foretrace.twin import TwinConfig, TwinImaginer
 
 LEVEL = 0.9
@@ -29,6 +30,8 @@ TWIN = TwinConfig(worlds=8, workers=1)
 """A few worlds in this process: a visitor waits for it, and others do meanwhile."""
 WORLDS = 128
 """Worlds of a belief that a monitor compares an execution with."""
+LEVER_UPS = 3
+"""Lever-ups from which constants are learned."""
 LOOK_AROUND = PlanConfig(refine=0, check=0)
 """What colours the rim: the first stage of a plan alone."""
 
@@ -184,11 +187,46 @@ class Session:
         Raises:
             ForetraceError: The lever-up cannot be imagined or simulated, or there is no such fault.
         """
-        imagined = self._once("believed", lambda: self._imagine(learned(), Belief(worlds=WORLDS)))
+        imagined = self._once("believed", self._believe)
         physics, offset, _ = self.draw()
         self.watched = watch(self.choices.object, self.action, imagined, (physics, offset), wish, self._rng)
         self.simulated = None
         return self.watched
+
+    def replay(self, interaction: Interaction) -> Watched:
+        """Take object and lever-up of an interaction, and let a monitor watch what was recorded.
+
+        Raises:
+            ForetraceError: It is no lever-up, has no motion, or cannot be imagined.
+        """
+        if not isinstance(interaction.action, LeverUp):
+            raise StudioError("the row is no lever-up with a motion: choose another one")
+        self.change(object=interaction.object, along=0.1, turn=0.0)
+        self.take(interaction.action)
+        self.watched = watch_again(interaction, self._once("believed", self._believe))
+        return self.watched
+
+    def learn(self) -> tuple[dict[str, float], list[Belief]]:
+        """Three lever-ups around the object in one world, simulated, and what each of them tells of its constants.
+
+        Returns:
+            The world's constants, all of them drawn, and what is believed after each lever-up.
+
+        Raises:
+            ForetraceError: One of the lever-ups cannot be imagined or simulated.
+        """
+        unknown = Session(self.choices.changed(**dict.fromkeys(PHYSICS), exact=True))
+        unknown._rng = self._rng
+        physics, _, drawn = unknown.draw()
+        config = SimulationConfig(embodiment="tool", physics=physics)
+        beliefs: list[Belief] = []
+        for number in range(LEVER_UPS):
+            unknown.change(along=(self.choices.along + number / LEVER_UPS) % 1.0)
+            action, obj = unknown.action, self.choices.object
+            effect = simulate_lever_up(obj, action, config).effect
+            prior = beliefs[-1] if beliefs else Belief()
+            beliefs.append(identify(TopDownView.of(obj, action), action, effect, prior, imaginer=learned()))
+        return drawn, beliefs
 
     def draw(self) -> tuple[Physics, ExecutionOffset, dict[str, float]]:
         """Constants and execution error of one world, and those of them that were unknown by name."""
@@ -227,6 +265,9 @@ class Session:
         view = TopDownView.of(obj, action)
         told = self._told(imaginer) if belief is None else belief
         return imaginer.imagine(view, action, context=told, com=com)
+
+    def _believe(self) -> ImaginedEffect:
+        return self._imagine(learned(), Belief(worlds=WORLDS))
 
     def _told(self, imaginer: Imaginer) -> dict[str, float]:
         return {name: value for name, value in self.choices.context.items() if name in imaginer.context}

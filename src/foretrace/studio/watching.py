@@ -9,7 +9,7 @@ from foretrace.actions import LeverUp
 from foretrace.errors import StudioError, shown
 from foretrace.experiments.executions import CAUSES, FAULTS, PERIOD, Scene, track, with_fault
 from foretrace.imagined import ImaginedEffect
-from foretrace.interactions.record import ExecutionOffset, Physics
+from foretrace.interactions.record import ExecutionOffset, Interaction, Physics
 from foretrace.monitoring import Monitor, Verdict
 from foretrace.objects import ObjectModel, Prism
 
@@ -33,6 +33,8 @@ class Watched:
     """True poses of the object's frame in the action frame."""
     verdicts: tuple[Verdict, ...]
     """What the monitor said after each sample."""
+    outcome: str = ""
+    """Of an interaction of a data set, its outcome there; nothing was made to go wrong."""
 
     @property
     def alarm(self) -> Verdict | None:
@@ -42,7 +44,25 @@ class Watched:
     @property
     def truth(self) -> str:
         """What went wrong, and the cause that a monitor calls it by."""
+        if self.outcome:
+            return f"{self.outcome}, as the data set has it"
         return f"{self.fault} (cause: {CAUSES[self.fault]})" if self.fault else "nothing went wrong"
+
+
+def watch_again(interaction: Interaction, imagined: ImaginedEffect) -> Watched:
+    """Let a monitor watch an interaction of a data set.
+
+    Raises:
+        StudioError: It is no lever-up, or has no motion.
+    """
+    action, effect = interaction.action, interaction.effect
+    if not isinstance(action, LeverUp) or len(effect.times) < 2:
+        raise StudioError("the row is no lever-up with a motion: choose another one")
+    monitor = Monitor(imagined)
+    verdicts = [
+        monitor.update(float(t), pose) for t, pose in zip(effect.times, effect.pose_trajectory, strict=True)
+    ]
+    return Watched("", action, effect.times, effect.pose_trajectory, tuple(verdicts), str(effect.outcome))
 
 
 def watch(
