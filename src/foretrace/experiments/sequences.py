@@ -72,6 +72,7 @@ EDGE = 0.06
 PUSH_SEARCH = PlanConfig(spacing=0.02, refine=3, samples=24, check=0)
 LEVER_SEARCH = PlanConfig(spacing=0.02, directions=1, refine=0, check=0)
 PUSHED = SimulationConfig(embodiment="tool", timestep=0.004, sample_period=0.04)
+MEDIANS = ("position_mm", "rotation_deg", "seconds")
 DRAWS = 2000
 """Bootstrap samples of an interval."""
 
@@ -307,8 +308,8 @@ def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
                 "episodes": len(mine),
                 "success_percent": {"mean": round(float(reached.mean()), 2), "low": round(float(low), 2),
                                     "high": round(float(high), 2)},
-                "actions": round(float(mine["actions"].mean()), 3),
-                **{name: round(float(mine[name].median()), 3) for name in ("position_mm", "rotation_deg", "seconds")},
+                "actions": round(float(np.mean(np.asarray(mine["actions"]))), 3),
+                **{name: round(float(np.median(np.asarray(mine[name]))), 3) for name in MEDIANS},
             }  # fmt: skip
         if found:
             summary[task] = found
