@@ -274,7 +274,7 @@ def _row(
         "position_mm": position,
         "rotation_deg": rotation,
         "seconds": seconds,
-        "outcomes": " ".join(outcome.replace(" ", "-") for outcome in found.outcomes),
+        "outcomes": " ".join(outcome.replace(" ", "-") for outcome in found.outcomes) or "none",
     }
 
 
@@ -300,7 +300,7 @@ def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
             mine = rows[(rows["task"] == task) & (rows["method"] == method)] if len(rows) else rows
             if not len(mine):
                 continue
-            reached = 100.0 * mine["reached"].astype(bool).to_numpy()
+            reached = 100.0 * np.asarray(mine["reached"], dtype=bool)
             rng = np.random.default_rng(0)
             means = reached[rng.integers(len(reached), size=(DRAWS, len(reached)))].mean(axis=1)
             low, high = np.percentile(means, [2.5, 97.5])
