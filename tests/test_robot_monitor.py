@@ -328,3 +328,19 @@ def test_the_command_watches_a_replayed_recording(plan_file, base_file, tmp_path
         assert said in told[0]
     assert cli.main(command(base_file, tmp_path, "--monitor")) == 2
     assert "--monitor needs a plan.json" in capsys.readouterr().err
+
+
+def test_a_plan_imagined_anew_tells_a_stuck_object_sooner(plan_file):
+    """The file keeps futures; the motions of a belief's worlds are narrower."""
+    plan, rng = ft.Plan.open(plan_file), np.random.default_rng(0)
+    view = ft.TopDownView.of(plan.object, plan.action)
+    start = ft.load_predictor().imagine(view, plan.action).pose_trajectory[0]
+    alarms = []
+    for watched in (plan, plan.imagined_by(ft.load_predictor(), ft.Belief())):
+        monitor = ft.Monitor(watched)
+        assert (watched.imagined.worlds is None) == (watched is plan)
+        poses = (
+            (t, np.array([*(start[:3] + rng.normal(0, 3e-4, 3)), *start[3:]])) for t in plan.imagined.times
+        )
+        alarms.append(next(t for t, pose in poses if monitor.update(t, pose).alarm))
+    assert alarms[1] < alarms[0] - 0.3

@@ -17,6 +17,7 @@ from foretrace.cli.console import say
 from foretrace.errors import RobotError
 from foretrace.files import write_json, write_text
 from foretrace.geometry import matrix_to_pose
+from foretrace.imagined import Belief
 from foretrace.interactions.dataset import Dataset
 from foretrace.monitoring import Monitor
 from foretrace.planning import Plan
@@ -152,7 +153,8 @@ def _pose_watch(
         RobotError: There is no plan, or no poses.
         PlanningError: The plan cannot be read.
         DatasetError: There is no such interaction.
-        MonitoringError: The plan imagines no rotations, or the share is out of range.
+        PredictionError: The plan's action is not the predictor's.
+        MonitoringError: The share is out of range.
     """
     if plan is None:
         raise RobotError("--monitor needs a plan.json of `foretrace plan`, which says what was imagined")
@@ -160,7 +162,10 @@ def _pose_watch(
         raise RobotError("--monitor needs --poses DATA ID, a recording of the action to rehearse with")
     folder, id = poses
     source = replay(Dataset.open(folder).with_id(id).effect)
-    return PoseWatch(Monitor(Plan.open(plan), false_alarms), source, alarm, speed, say)
+    from foretrace.predictor import load_imaginer  # not needed to move
+
+    watched = Plan.open(plan).imagined_by(load_imaginer(), Belief())
+    return PoseWatch(Monitor(watched, false_alarms), source, alarm, speed, say)
 
 
 def _action(

@@ -12,8 +12,10 @@ from foretrace.actions import Action
 from foretrace.errors import ForetraceError, PlanningError
 from foretrace.files import as_path, read_versioned, write_json
 from foretrace.geometry import invert_transform
-from foretrace.imagined import Futures, ImaginedEffect
-from foretrace.objects import ObjectModel
+from foretrace.imagined import Belief, Futures, ImaginedEffect, Imaginer
+from foretrace.imagined.context import Context
+from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import ObjectModel, Prism
 from foretrace.objects.model import object_from_dict
 from foretrace.schema import Count, Finite, Transform, Vector2
 
@@ -196,6 +198,20 @@ class Plan:
                 "T_table_object"
             )
         return replace(self.action, contact=T[:2, 3], direction=T[:2, 0])
+
+    def imagined_by(self, imaginer: Imaginer, context: Context | Belief = None) -> "Plan":
+        """The plan with its action imagined anew: a file keeps futures, but not the worlds of a belief.
+
+        Args:
+            imaginer: Imagines it.
+            context: What it is told. With a `Belief`, a monitor of the plan has the motions of its worlds.
+
+        Raises:
+            PredictionError: The imaginer does not imagine this action, or is not told such a context.
+            ViewError: The object does not fit into the view.
+        """
+        view = TopDownView.of(self.object or Prism(self.outline, self.height), self.action)
+        return replace(self, imagined=imaginer.imagine(view, self.action, context=context))
 
     def __repr__(self) -> str:
         x, y = 100 * self.action.contact
