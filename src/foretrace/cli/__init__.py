@@ -42,6 +42,9 @@ COMMANDS: dict[str, Entry] = {
     "demo": _command("demo:demo", "Simulate, train, predict and compare in a few minutes.", LEARN),
     "simulate": _command("simulation:simulate", "Simulate lever-ups of many objects into a data set.", LEARN),
     "data": _command("data:data", "Describe, check, repair or upgrade a data set.", LEARN),
+    "data-merge": _command("data:merge", "Make one data set of several.", LEARN),
+    "data-split": _command("data:split", "Make several data sets of one.", LEARN),
+    "data-sample": _command("data:sample", "Make a data set of some interactions.", LEARN),
     "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
     "recalibrate": _command("training:recalibrate", "Calibrate a predictor's regions on other data.", LEARN),
     "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
@@ -122,8 +125,8 @@ def read(arguments: Sequence[str]) -> Ready:
         SystemExit: Help was asked for and has been printed.
     """
     about = "Predict how an object will move before the robot touches it."
-    if list(arguments[:2]) == ["import", "pushes"]:
-        arguments = ["import-pushes", *arguments[2:]]
+    if (name := "-".join(arguments[:2])) in COMMANDS:  # `data merge` is data-merge
+        arguments = [name, *arguments[2:]]
     return parse(COMMANDS, arguments, "foretrace", about)
 
 

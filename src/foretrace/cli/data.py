@@ -1,12 +1,14 @@
-"""Commands about data sets: data, show."""
+"""Commands about data sets: data, data merge, data split, data sample, show."""
 
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
-from foretrace.cli.console import print_outcomes
+from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.errors import DatasetError
 from foretrace.files import write_json
+from foretrace.interactions import derive
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.description import describe_dataset
 from foretrace.interactions.doctor import examine
@@ -57,6 +59,63 @@ def _print_description(description: dict) -> None:
     for name, value in description.items():
         if not isinstance(value, dict) and name != "interactions":
             print(f"{name.replace('_', ' '):>42} {value:10.4g}")
+
+
+NOTHING_LEFT = "nothing was written; repeat the command"
+
+
+def merge(paths: Positional[tuple[Path, ...]], out: Path, skip_duplicates: bool = False) -> None:
+    """Make one data set of several.
+
+    Interactions and objects are numbered anew; the data sets stay as they are.
+
+    Args:
+        paths: Folders of the data sets.
+        out: Folder of the new data set.
+        skip_duplicates: Leave out interactions that were there before, instead of refusing them.
+    """
+    with when_interrupted(NOTHING_LEFT):
+        rows, skipped = derive.merge(paths, out, skip_duplicates)
+    left_out = f", {skipped} duplicates left out" if skipped else ""
+    print(f"data set: {out}, {rows} interactions{left_out}")
+
+
+def split(
+    path: Positional[Path],
+    out: Path,
+    shares: tuple[float, ...] = (0.8, 0.1, 0.1),
+    names: tuple[str, ...] = derive.PARTS,
+    by: Literal["object", "interaction"] = "object",
+    seed: int = 0,
+) -> None:
+    """Make several data sets of one.
+
+    Args:
+        path: Folder of the data set.
+        out: Folder of the new data sets.
+        shares: Share of each of them; they sum to 1.
+        names: Names of their folders within --out.
+        by: object: no object is in two of them. interaction: interactions are drawn at random.
+        seed: Decides what goes where.
+    """
+    with when_interrupted(NOTHING_LEFT):
+        counts = derive.split(path, out, shares, names, by, seed)
+    for name, rows in counts.items():
+        print(f"data set: {out / name}, {rows} interactions")
+
+
+def sample(path: Positional[Path], out: Path, number: int, seed: int = 0) -> None:
+    """Make a data set of some interactions of another one, drawn at random.
+
+    Args:
+        path: Folder of the data set.
+        out: Folder of the new data set.
+        number: Number of interactions.
+        seed: Decides which ones.
+    """
+    with when_interrupted(NOTHING_LEFT):
+        rows = derive.sample(path, out, number, seed)
+    print(f"data set: {out}, {rows} interactions")
 
 
 def show(

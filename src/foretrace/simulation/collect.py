@@ -50,6 +50,8 @@ CHUNK_SIZE = 10
 """Interactions that a local worker hands over at once; those of a cluster write whole shards themselves."""
 MANIFEST_PERIOD = 1.0
 """Seconds between two updates of the manifest: of shards that are written in between, a crash loses the checksum."""
+MANIFEST_SHARE = 20.0
+"""Its period, at least, in times that an update takes: a large manifest does not hold up those who wait for work."""
 RANDOMISATION_STREAM = 2
 """Tells the random numbers of what varies from those of objects, contact points and cameras."""
 
@@ -188,13 +190,14 @@ def collect(
         counts, todo = _take_stock(out, manifest, console)
         with ProgressReport("interactions", manifest["num_trials"], counts.total(), console) as report:
             make = _simulate_on_cluster if uses_cluster() else _simulate_shards
-            written = time.monotonic()
+            due = time.monotonic() + MANIFEST_PERIOD
             try:
                 for name, entry in make(config, out, todo, workers, simulate, counts, report):
                     manifest["shards"][name] = entry
-                    if time.monotonic() - written > MANIFEST_PERIOD:
+                    if (begun := time.monotonic()) > due:
                         storage.write_manifest(out, manifest)
-                        written = time.monotonic()
+                        took = time.monotonic() - begun
+                        due = begun + max(MANIFEST_PERIOD, MANIFEST_SHARE * took)
             finally:
                 storage.write_manifest(out, manifest)
     return count_outcomes(list(counts.elements()))
