@@ -33,7 +33,7 @@ from rich.console import Console
 
 from foretrace.errors import SimulationError
 from foretrace.files import write_json, write_text
-from foretrace.simulation.collect import CollectConfig, collect
+from foretrace.simulation.collect import CollectConfig, collect, num_trials
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.workers import on_cluster, run_jobs
 
@@ -42,6 +42,8 @@ MARK = "FORETRACE_NODE"
 """Variable of the environment that finds the processes of a node."""
 OBJECTS = 32
 """416 lever-ups in five shards."""
+SPEED_OBJECTS = 30
+"""378 lever-ups in four shards, two for each of two workers."""
 COMMAND = f"simulate --objects {OBJECTS} --embodiment tool --out"
 TARGETS = ("worker", "worker", "node", "node", "head", "command", "command", "ctrl-c")
 LIMIT = 300.0
@@ -266,7 +268,7 @@ def nothing(job: int) -> tuple[str, dict[str, Any], Counter[str]]:
 
 def speed(options: Options) -> int:
     """Times of the same work with and without Ray, in turns; exit status."""
-    config = CollectConfig(OBJECTS, simulation=SimulationConfig(embodiment="tool"))
+    config = CollectConfig(SPEED_OBJECTS, simulation=SimulationConfig(embodiment="tool"))
     times: dict[str, list[float]] = {}
 
     def measure(name: str, workers: int) -> None:
@@ -286,8 +288,6 @@ def speed(options: Options) -> int:
         jobs = 10_000
         list(run_jobs(nothing, range(jobs), 2, error=SimulationError))
         empty = jobs / (time.monotonic() - begun)
-        measure("warm", 2)
-        del times["warm"]
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     for _ in range(options.rounds):
         for workers in (1, 2):
@@ -297,7 +297,7 @@ def speed(options: Options) -> int:
                 measure(f"Ray, {workers}", workers)
     median = {name: statistics.median(values) for name, values in times.items()}
     results = {
-        "lever_ups": 13 * OBJECTS,
+        "lever_ups": num_trials(config),
         "seconds": times,
         "ratio_ray_to_local": {k: round(median[f"Ray, {k}"] / median[f"local, {k}"], 3) for k in (1, 2)},
         "scaling_1_to_2": {
