@@ -187,6 +187,7 @@ def _connect(address: str) -> tuple[Any, tuple[str, int]]:
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
     if not own:
         _reach(host.strip("[]"), int(port), address)
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "1")  # of 40 s each, where the head ends right now
         has_token = (
             any(os.environ.get(name) for name in TOKENS) or (Path.home() / ".ray/auth_token").is_file()
         )
