@@ -76,7 +76,10 @@ class WarpEngine(MujocoEngine):
                 "embodiment 'tool'"
             )
         with named_extras():
-            import_module("warp").config.quiet = True
+            warp = import_module("warp")
+            warp.config.log_level = (
+                warp.LOG_WARNING
+            )  # else each kernel that is loaded is a line on standard output
             import_module("mujoco_warp")
         super().__init__(embodiment, timestep, sample_period)
 
