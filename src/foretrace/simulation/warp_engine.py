@@ -77,9 +77,7 @@ class WarpEngine(MujocoEngine):
             )
         with named_extras():
             warp = import_module("warp")
-            warp.config.log_level = (
-                warp.LOG_WARNING
-            )  # else each kernel that is loaded is a line on standard output
+            warp.config.log_level = warp.LOG_WARNING  # else a line for each kernel that is loaded
             import_module("mujoco_warp")
         super().__init__(embodiment, timestep, sample_period)
 
