@@ -208,6 +208,7 @@ def one_kill(cluster: Loopback, number: int, seed: int, seconds: float, wanted: 
 
 def kills(options: Options) -> int:
     """All kills that are missing; exit status."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by the background jobs of a shell
     folder = options.folder
     folder.mkdir(parents=True, exist_ok=True)
     log, end = folder / "kills.jsonl", time.monotonic() + 60 * options.minutes

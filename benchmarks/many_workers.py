@@ -41,7 +41,7 @@ class Options:
     """Share of workers that are three times slower."""
     deaths_per_hour: float = 0.1
     """Deaths of each worker."""
-    hand_out: float = 1 / 700
+    hand_out: float = 1 / 240
     """Time that the command needs for a shard [s] (benchmarks/cluster.py --part speed)."""
     workers: tuple[int, ...] = (8, 100, 1_000, 10_000)
     """Numbers of workers."""
