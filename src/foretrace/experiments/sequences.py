@@ -209,7 +209,7 @@ class Sequences(Experiment):
                 "Success",
                 "Actions",
                 "Off at the end, median",
-                "Planning, median [s]",
+                "Episode, median [s]",
             ]
             parts += [f"## {WORDS[task]}", markdown_table(head, lines)]
         return "\n\n".join(parts) + "\n"
