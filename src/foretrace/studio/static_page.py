@@ -19,7 +19,7 @@ from matplotlib.colors import to_rgb
 
 from foretrace.actions import ToolPath
 from foretrace.actions.base import CORNER_MARGIN
-from foretrace.actions.lever_up import SCREWDRIVER, VARIED_ACTION
+from foretrace.actions.lever_up import APPROACH, SCREWDRIVER, VARIED_ACTION
 from foretrace.errors import StudioError, shown
 from foretrace.files import as_path, make_folder, write_bytes, write_text
 from foretrace.imagined import FLOOR, LEVELS
@@ -30,7 +30,6 @@ from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW
 from foretrace.objects import BEVEL, Prism
 from foretrace.objects.model import SIZE_LIMITS
 from foretrace.pictures.style import OBJECT_EDGE, OUTCOME_COLORS, SUPPORT_COLOR
-from foretrace.planning.candidates import BLADE
 from foretrace.predictor.portable import OnnxPredictor
 from foretrace.studio import stage
 from foretrace.studio.choices import FIRST, LIMITS, PHYSICS, Choices
@@ -167,7 +166,7 @@ def page_facts(predictor: OnnxPredictor) -> dict[str, Any]:
         "path": asdict(ToolPath()),
         "tool": [asdict(part) for part in SCREWDRIVER.parts()],
         "cornerMargin": CORNER_MARGIN,
-        "blade": BLADE,
+        "blade": APPROACH[0],
         "parameters": parameters,
         "physics": PHYSICS,
     }

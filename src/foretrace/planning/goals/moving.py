@@ -223,6 +223,8 @@ class Avoid(Goal):
                 radius = np.where(np.isfinite(found), found, 0.0)
             inside = np.where(motions.counts[rows][:, samples], apart <= radius, False)
             entered[rows, columns] = inside.any(axis=1)
+        if not motions.actions:  # an object at rest
+            return entered
         side, near, far = motions.actions[0].approach
         ways = np.array(
             [
