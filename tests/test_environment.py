@@ -125,7 +125,12 @@ def test_imagined_costs_are_minus_the_rewards_that_are_expected():
     found = cost.get_cost({name: values[None, None] for name, values in seen.items()}, actions)
     assert found.shape == (1, 24)
     best, worst = found[0].argmin(), found[0].argmax()
-    rewards = [made.step(actions[0, k, 0])[1] for k in (best, worst)]
+    rewards = []
+    for k in (best, worst):
+        made.reset(seed=0, options={"object": BOX})
+        rewards.append(made.step(actions[0, k, 0])[1])
+    with pytest.raises(PlanningError, match="call reset"):
+        made.step(actions[0, 0, 0])
     assert rewards[0] > rewards[1]
     assert -found[0, best] == pytest.approx(rewards[0], abs=0.15)
     torch = pytest.importorskip("torch")
@@ -137,7 +142,11 @@ def test_imagined_costs_are_minus_the_rewards_that_are_expected():
 
 @pytest.mark.parametrize(
     ("shape", "views", "wanted"),
-    [((1, 4, 2, 2), 1, "an episode has one action"), ((2, 4, 1, 2), 1, "not that of 2 environments")],
+    [
+        ((1, 4, 2, 2), 1, "an episode has one action"),
+        ((2, 4, 1, 2), 1, "not that of 2 environments"),
+        ((1, 0, 1, 2), 1, "candidates are none"),
+    ],
 )
 def test_costs_of_something_else_are_refused(shape, views, wanted):
     made = environment.LeverUpEnv()

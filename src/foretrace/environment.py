@@ -96,6 +96,7 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
         self.action_space = spaces.Box(-1.0, 1.0, (2 + len(VARIED_ACTION) * vary_path,), np.float32)
         self._drawn: tuple[ObjectModel, LeverUp, Scene, Physics] | None = None
         self._last: tuple[LeverUp, Effect] | None = None
+        self._over = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -121,15 +122,16 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
         physics = Physics()
         if self.randomise:
             physics = Physics(**{name: float(rng.uniform(*getattr(RANDOMISED, name))) for name in TOLD})
-        self._drawn, self._last = (obj, camera, scene, physics), None
+        self._drawn, self._last, self._over = (obj, camera, scene, physics), None, False
         return self._observation(), {"object": obj, "physics": physics}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Lever the object up; the episode is over then."""
-        if self._drawn is None:
-            raise PlanningError("there is no object yet: call reset first")
+        if self._drawn is None or self._over:
+            raise PlanningError("there is no object yet, or its episode is over: call reset first")
         obj, camera, scene, physics = self._drawn
         lever = self.lever_up(action)
+        self._over = True
         one = Candidates(np.zeros(1), np.zeros(1), (lever,))
         if not find_free(scene, one)[0][0]:
             self._last = None
@@ -247,6 +249,7 @@ class ImaginedCost:
         self, goal: Goal | Callable[..., Any] | None = None, imaginer: Imaginer | None = None
     ) -> None:
         self.goal = goals.Lift() if goal is None else as_goal(goal)
+        check_type("imaginer", imaginer, (Imaginer, type(None)), PlanningError, "an imaginer of lever-ups")
         self.imaginer = load_imaginer() if imaginer is None else imaginer
 
     def get_cost(self, info: Mapping[str, Any], candidates: Any) -> Any:
@@ -274,8 +277,10 @@ class ImaginedCost:
                 f"candidates have the shape {actions.shape}: give (B, S, 1, A) with A = {sizes[0]} or {sizes[1]}; an "
                 "episode has one action"
             )
-        if not np.isfinite(actions).all():
-            raise PlanningError("candidates are not all finite: give numbers from -1 to 1")
+        if not actions.size or not np.isfinite(actions).all():
+            raise PlanningError(
+                "candidates are none, or not all finite: give numbers, of which -1 to 1 count"
+            )
         count, actions = len(actions), actions.reshape(*actions.shape[:2], -1)
         try:
             seen = {name: np.asarray(info[name]) for name in ("mask", "height", "context")}
@@ -284,7 +289,7 @@ class ImaginedCost:
                 for name in ("mask", "height")
             }
             last["context"] = seen["context"].reshape(count, -1, len(TOLD))[:, -1]
-        except (KeyError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise PlanningError(
                 f"info is not that of {count} environments: give mask, height and context as they are observed"
             ) from error

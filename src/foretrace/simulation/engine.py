@@ -94,6 +94,9 @@ class Engine(ABC):
             ActionError: The arm cannot follow the tool's motion.
         """
 
+    def check_physics(self, physics: Physics) -> None:  # noqa: B027
+        """Refuse physics that the engine cannot play, with a `SimulationError`; most play any."""
+
     def play_many(self, plays: Sequence[Play]) -> list[Motion]:
         """Plays actions that have nothing to do with each other, in their order; raises as `play` does."""
         return [self.play(**vars(play)) for play in plays]

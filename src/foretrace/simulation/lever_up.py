@@ -91,7 +91,8 @@ class SimulationConfig:
         check_ranges(SimulationError, "physics", self.physics, {"rolling_friction": (0.0, 0.1)}, LEVER_ARM)
         if self.physics.table_edge is not None and not 0 < self.physics.table_edge <= 10:
             raise SimulationError(f"table_edge = {self.physics.table_edge} m: give a distance up to 10 m")
-        make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
+        engine = make_engine(self.engine, self.embodiment, self.timestep, self.sample_period)
+        engine.check_physics(self.physics)
         if self.camera not in CAMERAS:
             raise SimulationError(
                 f"camera {shown(self.camera)} is unknown: choose one of {', '.join(CAMERAS)}"

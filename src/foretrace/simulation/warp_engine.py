@@ -19,6 +19,7 @@ from foretrace.actions import Motion
 from foretrace.errors import SimulationError, shown
 from foretrace.extras import named_extras
 from foretrace.geometry import matrix_to_pose, planar_transform
+from foretrace.interactions.record import Physics
 from foretrace.objects import HullShape, ObjectModel
 from foretrace.simulation.engine import Play, sample_tool
 from foretrace.simulation.mujoco_engine import ControlPath, MujocoEngine, plan_carriage
@@ -81,6 +82,17 @@ class WarpEngine(MujocoEngine):
             import_module("mujoco_warp")
         super().__init__(embodiment, timestep, sample_period)
 
+    def check_physics(self, physics: Physics) -> None:
+        """Refuse a table with an edge within reach.
+
+        Raises:
+            SimulationError: Naming it.
+        """
+        if physics.table_edge is not None:
+            raise SimulationError(
+                f"engine 'warp' has a table without edges: table_edge = {physics.table_edge} m; take engine 'mujoco'"
+            )
+
     def play(self, *arguments: Any, **named: Any) -> Motion:
         """Plays one action: a batch of one."""
         return self.play_many([Play(*arguments, **named)])[0]
@@ -92,11 +104,7 @@ class WarpEngine(MujocoEngine):
             SimulationError: An object has round pieces, a table has an edge, or contacts found no room.
         """
         for play in plays:
-            if play.physics.table_edge is not None:
-                raise SimulationError(
-                    f"engine 'warp' has a table without edges: table_edge = {play.physics.table_edge} m; "
-                    "take engine 'mujoco'"
-                )
+            self.check_physics(play.physics)
         controls = [self._control(play) for play in plays]
         groups: dict[Any, list[int]] = {}
         for row, (play, control) in enumerate(zip(plays, controls, strict=True)):
