@@ -170,6 +170,7 @@ def test_a_frozen_tracker_is_named():
 BAD = {
     "NaN": (1.0, [np.nan, 0, 0, 1, 0, 0, 0], "not finite"),
     "off unit": (1.0, [*COM, 1.0, 0.5, 0, 0], "length 1.118, not 1"),
+    "millimetres": (1.0, [105.0, 0, 20.0, 1000.0, 0, 0, 0], "the position lies 106.9 m from the origin"),
     "back in time": (0.2, [*COM, 1.0, 0, 0, 0], "times must rise: 0.2 s follows 0.45 s"),
     "no time": (np.nan, [*COM, 1.0, 0, 0, 0], "the time is nan"),
 }

@@ -58,6 +58,7 @@ def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert run(f"{command} --steps 3 --spacing 0.04 --refine 1 --samples 16 --tool-friction 0.25") == 0
     told = capsys.readouterr().out
     assert "push 1: contact x" in told
+    assert "in its frame at the start" in told
     content = json.loads(Path("plan/sequence.json").read_text())
     first = ft.Plan.open("plan/plan.json")
     assert content["actions"][0] == first.action.to_dict()
@@ -67,8 +68,19 @@ def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "does not know where the object lies" in refused
     assert run(f"{command} --steps 3 --base base.json --pose 0 0 0") == 2
     assert "--base goes with one action" in capsys.readouterr().err
+    assert run(f"{command} --tool-friction 30") == 2
+    assert "tool_friction is 30.0: give a value from 0 to 10" in capsys.readouterr().err
+    assert run(f"{command} --friction 0.5") == 2
+    assert "--friction: the sliding twin imaginer is not conditioned on it" in capsys.readouterr().err
     assert run(f"{command} somewhere") == 2
     assert "somewhere learned single lever-ups: leave it out" in capsys.readouterr().err
+
+
+def test_a_plan_leaves_no_sequence_of_an_earlier_one(files: Path) -> None:
+    Path("plan").mkdir()
+    Path("plan/sequence.json").write_text("{}")
+    assert main(["plan", "--polygon", "outline.txt", *QUICK]) == 0
+    assert sorted(file.name for file in Path("plan").iterdir()) == ["plan.json", "plan.png"]
 
 
 def test_object_of_a_data_set(files: Path) -> None:

@@ -52,6 +52,13 @@ def test_what_is_not_told_widens_the_regions():
     assert np.isfinite(unknown.futures.radius(0.5)[0, 0]).all()
 
 
+def test_ranges_that_make_no_difference_are_pointed_out():
+    push = ft.Push.at_edge(PLATE, 0)
+    told = imagine(push, context=ft.Belief({"friction": (0.3, 0.9), "density": (500.0, 600.0)}, worlds=2))
+    assert "friction and density make no difference" in told.warnings[-1]
+    assert not imagine(push, context=ft.Belief({"tool_friction": (0.3, 0.4)}, worlds=2)).warnings
+
+
 def test_a_rod_beside_the_object_loses_it():
     far = ft.Push.at_edge(PLATE, 0, 0.95, path=ft.PushPath(distance=0.11))
     assert imagine(far).futures.outcomes()["turned away"] == 1
@@ -89,7 +96,7 @@ BAD = {
             ft.TopDownView.of(PLATE, ft.LeverUp.at_edge(PLATE, 0)), ft.LeverUp.at_edge(PLATE, 0)
         ),
         PredictionError,
-        "a lever-up never ends 'pushed', as sliding twin has it",
+        "the sliding twin imaginer imagines a push, not a lever-up: give an imaginer of a lever-up, such as ft.Twin",
     ),
     "a lift": (
         lambda: ft.plan(PLATE, ft.goals.Lift(), TWIN, config=QUICK),
@@ -105,6 +112,21 @@ BAD = {
         lambda: imagine(ft.Push.at_edge(PLATE, 0), context={"friction": 0.5}),
         PredictionError,
         "not on 'friction': leave it out of context",
+    ),
+    "a negative friction of the rod": (
+        lambda: imagine(ft.Push.at_edge(PLATE, 0), context={"tool_friction": -5.0}),
+        PredictionError,
+        "context tool_friction is -5.0: give a value from 0 to 10",
+    ),
+    "a friction of 50": (
+        lambda: imagine(ft.Push.at_edge(PLATE, 0), context={"tool_friction": 50.0}),
+        PredictionError,
+        "context tool_friction is 50.0: give a value from 0 to 10",
+    ),
+    "a belief in a negative friction": (
+        lambda: ft.Belief({"tool_friction": (-0.1, 0.3)}),
+        PredictionError,
+        r"tool_friction has the range \(-0.1, 0.3\): give numbers from 0 to 10",
     ),
     "worlds": (
         lambda: SlidingTwin(worlds=1),

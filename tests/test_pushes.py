@@ -328,7 +328,9 @@ def test_imaginers_of_lever_ups_refuse_pushes():
         lambda: ft.TwinImaginer().imagine_candidates(view, [push]),
         lambda: ft.identify(view, push, effect),
     ):
-        with pytest.raises(PredictionError, match=r"a push never ends 'levered', as .* has it"):
+        with pytest.raises(
+            PredictionError, match=r"imagines a lever-up, not a push: .* such as ft.SlidingTwin\(\)"
+        ):
             imagine()
 
 

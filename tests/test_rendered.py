@@ -35,10 +35,16 @@ def test_the_arm_follows_from_the_tool_and_what_was_imagined_is_drawn() -> None:
     assert 0.0005 < drawn.mean() < 0.2
 
 
+def test_the_arm_that_pushes_is_drawn() -> None:
+    push = ft.Push.at_edge(PRISM, 2, path=ft.PushPath(distance=0.02, speed=0.1))
+    with_arm, alone = (first_picture(ft.simulate(PRISM, push, embodiment=name)) for name in ("arm", "tool"))
+    assert (np.abs(with_arm - alone).max(axis=2) > 40).mean() < 0.01  # the same posture
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--arm"], "--arm renders one lever-up: choose it with --id"),
+        (["--arm"], "--arm renders one interaction: choose it with --id"),
         (["--run", "r"], "--run r goes with --arm"),
     ],
 )

@@ -1,6 +1,7 @@
 """Sequences of actions: composed, carried out, and planned again."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,16 @@ class Moved:
         step = motions.resting_frames()[0][0]
         self.T = T_table_object @ step @ planar_transform([0.0, 0.0, 0.0], self.extra)
         return "pushed"
+
+
+class Lost(Moved):
+    def locate(self):
+        return np.full((4, 4), np.nan)
+
+
+class Blind(Moved):
+    def observe(self) -> Any:
+        return None
 
 
 def _view(action):
@@ -172,6 +183,14 @@ BAD = {
     "a lift": (
         lambda: plan_sequence(PLATE, ft.goals.Lift(), 2),
         r"the goal Lift\(\) is about an object that is levered, a sequence ends with the object at rest",
+    ),
+    "a world that has lost the object": (
+        lambda: execute_sequence(Lost(), FAR, 2, TWIN),
+        r"the frame that the world's locate\(\) returns",
+    ),
+    "a world that sees nothing": (
+        lambda: execute_sequence(Blind(), FAR, 2, TWIN),
+        r"the world's observe\(\) returned a value of type NoneType: give ObjectModel or TopDownView",
     ),
     "far away": (
         lambda: plan_sequence(PLATE, ft.goals.MoveTo((3.0, 0.0)), 2, TWIN),

@@ -164,11 +164,11 @@ def show(
 
 
 def _show_arm(path: Path, id: int | None, out: Path | None, arm: bool, run: Path | None) -> None:
-    """Render one lever-up with the arm."""
+    """Render one interaction with the arm."""
     if not arm:
         raise DatasetError(f"--run {run} goes with --arm: add it, or compare with `foretrace predict --data`")
     if id is None:
-        raise DatasetError("--arm renders one lever-up: choose it with --id")
+        raise DatasetError("--arm renders one interaction: choose it with --id")
     from foretrace.pictures.rendered import rendered_animation
 
     dataset = Dataset.open(path)

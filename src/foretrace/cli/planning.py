@@ -160,6 +160,7 @@ def plan(
         steps: Actions in a row, at most. With more than one, they are planned until the object rests after each:
             plan.json has the first, sequence.json all of them.
         unknown: Tell the imaginers only the constants that are given here; by default the others are the nominal ones.
+            Each push is then imagined 32 times: with --steps, a plan may take a minute; --spacing 0.02 makes it faster.
         out: Folder for plan.json and plan.png.
     """
     from foretrace.interactions.recording_folder import write_image
@@ -172,6 +173,10 @@ def plan(
         if not 0 < value < float("inf"):
             raise PlanningError(f"{_option(name)} is {value}: give a number above 0")
     predictor = _imaginer(run, action, steps)
+    if idle := [_option(name) for name in given if name not in predictor.context]:
+        raise PlanningError(
+            f"{' and '.join(idle)}: the {predictor.name} imaginer is not conditioned on it, leave it out"
+        )
     told: Any = None
     if given or unknown:
         usual = {} if unknown else dict(predictor.nominal)
@@ -189,6 +194,7 @@ def plan(
         reach=_reach(where, T_table_object),
     )
     out.mkdir(parents=True, exist_ok=True)
+    (out / "sequence.json").unlink(missing_ok=True)  # of an earlier plan
     say_plan(found)
     found.save(out / "plan.json")
     draw_plan(found, out / "plan.png")
@@ -239,6 +245,7 @@ def _plan_several(
     if found.note:
         say(f"note: {found.note}")
     print(f"goal: {found.goal}")
+    print("contacts in the object's frame before each action; where it lies, in its frame at the start:")
     for k, (action, T) in enumerate(zip(found.actions, found.frames[1:], strict=True), start=1):
         (x, y), (dx, dy) = action.contact, action.direction
         turn = np.degrees(np.arctan2(T[1, 0], T[0, 0]))

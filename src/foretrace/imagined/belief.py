@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import PredictionError, check_type, is_number, is_whole, shown
+from foretrace.interactions.record import PHYSICS_RANGES
 
 RANGES: Mapping[str, tuple[float, float]] = {
     "friction": (0.5, 1.1),
@@ -149,4 +150,7 @@ def _range(name: object, pair: Any) -> tuple[float, float]:
     fits = isinstance(pair, tuple | list) and len(pair) == 2 and all(map(is_number, pair))
     if not fits or not -np.inf < pair[0] <= pair[1] < np.inf:
         raise PredictionError(f"{name} has the range {shown(pair)}: give a least and a greatest number")
+    low, high = PHYSICS_RANGES.get(str(name), (-np.inf, np.inf))
+    if not low <= pair[0] <= pair[1] <= high:
+        raise PredictionError(f"{name} has the range {shown(pair)}: give numbers from {low:g} to {high:g}")
     return float(pair[0]), float(pair[1])

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from foretrace.actions import ACTIONS, Action
 from foretrace.errors import PredictionError, TrainingError, shown
 from foretrace.interactions.batch import InteractionBatch
-from foretrace.interactions.record import Physics
+from foretrace.interactions.record import PHYSICS_RANGES, Physics
 
 CONSTANTS = {
     "friction": "of object and table",
@@ -154,8 +154,8 @@ def given_context(
         usual: Constants that a context of None tells; by default the nominal ones.
 
     Raises:
-        PredictionError: A value is missing, is no finite number, contradicts an action's path, or is none that the
-            imaginer is conditioned on.
+        PredictionError: A value is missing, is no finite number or out of range, contradicts an action's path, or is
+            none that the imaginer is conditioned on.
     """
     nominal = nominal_parameters(kind)
     told = _told(names, context, optional, nominal_constants() if usual is None else usual)
@@ -206,6 +206,9 @@ def _told(
             raise PredictionError(
                 f"context {name} is {shown(value)}: give a finite value {CONTEXT.get(name, 'in m')}"
             )
+        low, high = PHYSICS_RANGES.get(name, (-np.inf, np.inf))
+        if not low <= value <= high:
+            raise PredictionError(f"context {name} is {shown(value)}: give a value from {low:g} to {high:g}")
     if context.get(EXACT, 0) != 0:
         raise PredictionError(
             f"context {EXACT} is {shown(context[EXACT])}: give 0 for a contact as commanded, or leave it out"

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from foretrace.actions import Action
 from foretrace.errors import PredictionError, check_type, shown
 from foretrace.geometry import Numbers, finite_array, rotation_vector_to_quaternion
-from foretrace.imagined.belief import Belief
+from foretrace.imagined.belief import RANGES, Belief
 from foretrace.imagined.context import (
     CONSTANTS,
     UNKNOWN,
@@ -51,6 +51,8 @@ Start = Literal["observed", "estimated"]
 STARTS: tuple[Start, ...] = ("observed", "estimated")
 
 
+READY = {"lever-up": "ft.TwinImaginer()", "push": "ft.SlidingTwin()"}
+"""Imaginers that messages name, by the label of the action."""
 CANDIDATE_WORLDS = 32
 """Worlds that each of several candidates is imagined in, where a belief is averaged over."""
 UNSURE = 0.01
@@ -301,9 +303,10 @@ class Imaginer(ABC):
         """Refuse another kind of action than the one whose motions are imagined."""
         odd = [name for name in self.learned_outcomes if name not in action.outcomes]
         if odd:
+            ready = f", such as {READY[action.label]}" if action.label in READY else ""
             raise PredictionError(
-                f"{who}a {action.label} never ends {shown(odd[0])}, as {self.name} has it: "
-                "give the kind of action that it learned from, or another imaginer"
+                f"{who}the {self.name} imaginer imagines a {self.action.label}, not a {action.label}: give an imaginer "
+                f"of a {action.label}{ready}"
             )
 
     def _told(self, context: Context, parameters: dict[str, np.ndarray], number: int) -> np.ndarray:
@@ -352,7 +355,7 @@ class Imaginer(ABC):
         futures = average_worlds(played.futures[np.arange(count)], count, com[None])
         worlds = gather_worlds(played, values, causes)
         own = {name: np.array([value]) for name, value in parameters.items()}
-        answer = self._finish(futures, played.warnings[:1], own)
+        answer = self._finish(futures, played.warnings[:1] or ((),), own, belief)
         return replace(answer[0], worlds=worlds)
 
     def _average(
@@ -371,12 +374,23 @@ class Imaginer(ABC):
         together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
         wide = [np.broadcast_to(each.quantiles, (1, each.quantiles.shape[-1])) for each in parts]
         futures = replace(parts[0], **together, quantiles=np.concatenate(wide))
-        return self._finish(futures, tuple(warnings), parameters_of(actions))
+        return self._finish(futures, tuple(warnings), parameters_of(actions), belief)
 
     def _finish(
-        self, futures: Futures, warnings: tuple[tuple[str, ...], ...], parameters: dict[str, np.ndarray]
+        self,
+        futures: Futures,
+        warnings: tuple[tuple[str, ...], ...],
+        parameters: dict[str, np.ndarray],
+        belief: Belief,
     ) -> ImaginedBatch:
         """Effects whose averaged futures these are, with warnings and what is told of their contexts."""
+        idle = [
+            name for name in CONSTANTS if name in RANGES and name not in self.context
+            if belief.ranges[name] != RANGES[name]
+        ]  # fmt: skip
+        if idle:
+            note = f"the belief's {' and '.join(idle)} make no difference: the {self.name} is not conditioned on them"
+            warnings = tuple((*each, note) for each in warnings)
         best = futures.states[np.arange(len(futures)), futures.probability.argmax(axis=1)]
         pose = np.concatenate([best[..., :3], rotation_vector_to_quaternion(best[..., 3:])], axis=-1)
         told = np.full((len(futures), len(self.context)), np.nan)

@@ -110,6 +110,10 @@ class Physics:
     """Distance of the table's far edge ahead of the contact point [m]; None: no edge within reach."""
 
 
+PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
+"""What is possible: friction coefficients, densities of anything solid [kg/m^3]."""
+
+
 @dataclass(frozen=True)
 class ExecutionOffset:
     """Execution error: offset of the executed action from the commanded one, as in `Action.moved`.
@@ -177,6 +181,6 @@ class Interaction:
     def __repr__(self) -> str:
         made = self.provenance
         return (
-            f"Interaction({self.id}: {self.action.label} of a {self.object.kind}, {self.effect.outcome}, "
+            f"Interaction({self.id}: {self.action.label} of a {self.object.shape.kind}, {self.effect.outcome}, "
             f"{len(self.effect.times)} samples, {made.source})"
         )

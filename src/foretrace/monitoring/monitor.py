@@ -41,6 +41,8 @@ QUIET = 3e-4
 """An object is at rest until a believed motion has moved it by more than this [m]."""
 BEFORE = 0.25
 """Time before an alarm at which the best motion is still trusted [s]."""
+FARTHEST = 10.0
+"""A position farther from the origin of its frame is a mistake, such as one in other units [m]."""
 FAR = 0.15
 """The object frame lies at most so far from the centre of mass [m], if its pose at rest is not told."""
 SHIFTED = 400
@@ -113,7 +115,7 @@ class Monitor:
         self._told_rest = None
         if rest is not None:
             told = finite_array("rest", rest, (7,), MonitoringError)
-            if (wrong := _wrong_quaternion(told)) is not None:
+            if (wrong := _wrong_pose(told)) is not None:
                 raise MonitoringError(f"rest: {wrong}")
             self._told_rest = self._enter(told)
         far = np.linalg.norm(motions.states[motions.believed], axis=2)
@@ -192,7 +194,7 @@ class Monitor:
             return None
         if not np.isfinite(pose).all():
             return f"the pose at {t:g} s is not finite"
-        return _wrong_quaternion(pose)
+        return _wrong_pose(pose)
 
     def _take(self, t: float, pose: Float[np.ndarray, "7"]) -> None:
         """Compare a pose in the action frame with all motions."""
@@ -368,7 +370,9 @@ def _seven(pose: Any) -> Float[np.ndarray, "7"]:
     return found
 
 
-def _wrong_quaternion(pose: Float[np.ndarray, "7"]) -> str | None:
+def _wrong_pose(pose: Float[np.ndarray, "7"]) -> str | None:
+    if (far := float(np.linalg.norm(pose[:3]))) > FARTHEST:
+        return f"the position lies {far:.4g} m from the origin of its frame: give metres, not millimetres"
     length = float(np.linalg.norm(pose[3:]))
     wrong = abs(length - 1) > UNIT_TOLERANCE
     return f"the quaternion (w, x, y, z) has length {length:.4g}, not 1: normalise it" if wrong else None

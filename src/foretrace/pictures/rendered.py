@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.colors import to_rgb
 
-from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError
 from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
 from foretrace.imagined import ImaginedEffect
@@ -34,7 +33,7 @@ WIDEST = 0.05
 
 
 def rendered_animation(interaction: Interaction, path: Path, imagined: ImaginedEffect | None = None) -> Path:
-    """Write a lever-up with the whole arm as a GIF or MP4, in real time.
+    """Write an interaction with the whole arm as a GIF or MP4, in real time.
 
     Where the record has no joint angles, they follow from the tool's poses.
 
@@ -44,12 +43,11 @@ def rendered_animation(interaction: Interaction, path: Path, imagined: ImaginedE
         imagined: What had been imagined: the path of the most probable future is orange, and its region translucent.
 
     Raises:
-        DatasetError: It is no lever-up, or has no motion.
+        DatasetError: It has no motion.
+        ActionError: The arm cannot follow the tool's poses.
         SimulationError: The machine cannot render.
         PredictionError: The ending is unknown, or MP4 cannot be written here.
     """
-    if not isinstance(interaction.action, LeverUp):
-        raise DatasetError(f"a {interaction.action.label} is not done by the arm: draw it without --arm")
     times = interaction.effect.times
     if len(times) < 2:
         raise DatasetError("the interaction has no motion: choose another one")

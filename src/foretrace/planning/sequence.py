@@ -68,8 +68,10 @@ class Sequence:
 
     def __repr__(self) -> str:
         note = f", {self.note}" if self.note else ""
+        count, label = len(self.actions), self.action.label
+        plural = "" if count == 1 else "es" if label.endswith("sh") else "s"
         return (
-            f"Sequence({self.goal}: {len(self.actions)} times {self.action.label}, cost {self.cost:.3f}, "
+            f"Sequence({self.goal}: {count} {label}{plural}, cost {self.cost:.3f}, "
             f"reached {self.reached:.3f}{note})"
         )
 
@@ -197,11 +199,11 @@ def execute_sequence(
             the object is expected.
 
     Raises:
-        PlanningError: As `plan_sequence`; only before the first action. Later, a plan that cannot be made ends the
-            sequence.
+        PlanningError: As `plan_sequence`, before the first action; later, a plan that cannot be made ends the
+            sequence. Or the world's `locate` returns no frame.
     """
     check_type("world", world, World, PlanningError, "a World: observe, locate, act")
-    seen, T_table_start = world.observe(), world.locate()
+    seen, T_table_start = _observed(world), _located(world)
     config = _config(config, imaginer)
     aim, scene = _begin(seen, goal, steps, None)
     own = _resting(imaginer, scene)
@@ -214,7 +216,7 @@ def execute_sequence(
         if replan or not sequences:
             try:
                 if actions:
-                    scene = replace(Scene.of(world.observe()), T_start_now=frames[-1], com_start=com)
+                    scene = replace(Scene.of(_observed(world)), T_start_now=frames[-1], com_start=com)
                 found, known = _plan(scene, aim, steps - len(actions), own, context, config, known)
             except ForetraceError:
                 if not actions:
@@ -230,11 +232,21 @@ def execute_sequence(
         T_start_now = frames[-1] if replan else T_start_expected
         outcomes.append(world.act(action, T_table_start @ T_start_now))
         actions.append(action)
-        frames.append(T_start_table @ world.locate())
+        frames.append(T_start_table @ _located(world))
         state = _state(aim, scene, com, frames[-1], outcomes[-1])
     return Execution(
         tuple(actions), tuple(outcomes), np.array(frames), tuple(sequences), bool(state[1]), float(state[0])
     )
+
+
+def _observed(world: World) -> ObjectModel | TopDownView:
+    seen = world.observe()
+    check_type("the world's observe() returned a value", seen, (ObjectModel, TopDownView), PlanningError)
+    return seen
+
+
+def _located(world: World) -> Float[np.ndarray, "4 4"]:
+    return finite_array("the frame that the world's locate() returns", world.locate(), (4, 4), PlanningError)
 
 
 def _begin(seen: Any, goal: Any, steps: int, com: Numbers | None) -> tuple[Goal, Scene]:

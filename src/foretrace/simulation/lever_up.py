@@ -29,6 +29,7 @@ from foretrace.geometry import (
 )
 from foretrace.interactions.record import (
     NO_OFFSET,
+    PHYSICS_RANGES,
     Effect,
     ExecutionOffset,
     Interaction,
@@ -47,8 +48,6 @@ GRID_STREAM = 4
 LARGEST_SEED = 2**63 - 1
 SHORTEST, LONGEST = 1e-5, 1.0
 """Limits of time steps and sample periods [s]."""
-PHYSICS_RANGES = {"friction": (0.0, 10.0), "tool_friction": (0.0, 10.0), "density": (1.0, 100_000.0)}
-"""What is simulated: friction coefficients, densities of anything solid [kg/m^3]."""
 LEVER_ARM = "it is a lever arm in metres, a tenth of a millimetre on a hard table"
 FALL_DEPTH = 0.5
 """The record of a falling object ends this far below the table top, above the floor [m]."""

@@ -108,11 +108,8 @@ class SlidingTwin(Imaginer):
     rests = True
 
     def __post_init__(self) -> None:
-        if (
-            not is_whole(self.worlds, 2, 65536)
-            or not is_number(self.duration)
-            or not 0.5 <= self.duration <= 600
-        ):
+        fits = is_number(self.duration) and 0.5 <= self.duration <= 600
+        if not fits or not is_whole(self.worlds, 2, 65536):
             raise PredictionError(
                 f"worlds is {shown(self.worlds)}, duration {shown(self.duration)}: give a whole number from 2 to "
                 "65536, and seconds from 0.5 to 600"
@@ -319,10 +316,7 @@ def _axes(scenes: Scenes, rows: np.ndarray) -> Float[np.ndarray, "rows 2 2"]:
 def groups_of(pushes: RecordedPushes) -> dict[Group, np.ndarray]:
     """Rows of each shape on each surface."""
     keys = [(pushes.surface[k], pushes.shapes[pushes.shape[k]].name) for k in range(len(pushes))]
-    found: dict[Group, list[int]] = {}
-    for row, key in enumerate(keys):
-        found.setdefault(key, []).append(row)
-    return {key: np.array(rows) for key, rows in found.items()}
+    return {key: np.array([k for k, each in enumerate(keys) if each == key]) for key in dict.fromkeys(keys)}
 
 
 def _play(
@@ -356,9 +350,7 @@ def _fit(
 ) -> tuple[Float[np.ndarray, " names"], Float[np.ndarray, "names names"]]:
     """Most probable values and their covariance, by Gauss and Newton's method.
 
-    Priors are normal, errors have long tails.
-
-    A standard deviation of 0 of the spread along y ties it to that along x.
+    Priors are normal, errors have long tails. A standard deviation of 0 of the spread along y ties it to that along x.
     """
     free = np.flatnonzero(std > 0)
     tied = std[SPREADS[1]] == 0
@@ -377,8 +369,7 @@ def _fit(
         return ((found - truth) / SCALE).reshape(len(values), -1)
 
     truth, groups = pushes.displacement(), groups_of(pushes)
-    values, damping = mean.copy(), 1e-2
-    covariance = np.diag(std**2)
+    values, covariance, damping = mean.copy(), np.diag(std**2), 1e-2
     for _ in range(ITERATIONS):
         errors, *stepped = residuals(np.stack([values, *(values + np.diag(STEP)[free])]))
         slopes = ((np.array(stepped) - errors) / STEP[free, None]).T
