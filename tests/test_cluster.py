@@ -31,6 +31,10 @@ class CrashedError(Exception):
     """A stand-in for what Ray raises where a process died."""
 
 
+class RemoteError(Exception):
+    """A stand-in for what Ray raises where a function cannot be run, with the traceback as its text."""
+
+
 class FakeRay:
     """A cluster in this process: a job is done when it is asked for, and dies as often as is said before."""
 
@@ -38,6 +42,7 @@ class FakeRay:
         self.deaths, self.cpus, self.most, self.cancelled = deaths or {}, cpus, 0, []
         names = ("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError", "ObjectLostError")
         self.exceptions = SimpleNamespace(**dict.fromkeys((*names, "LocalRayletDiedError"), CrashedError))
+        self.exceptions.RayTaskError = RemoteError
 
     def remote(self, function):
         return SimpleNamespace(
@@ -91,6 +96,10 @@ def odd(job: int) -> int:
     raise DatasetError(f"job {job} is odd")
 
 
+def lacking(job: int) -> int:
+    raise RemoteError("ray::_work() (pid=1)\nModuleNotFoundError: No module named 'foretrace'")
+
+
 def run(function, jobs, workers=3, **options) -> list[int]:
     return list(run_jobs(function, jobs, workers, error=SimulationError, **options))
 
@@ -137,6 +146,7 @@ def test_a_head_that_is_gone_ends_the_work(begin, monkeypatch):
     ("function", "error", "message"),
     [
         (odd, DatasetError, "job 0 is odd"),
+        (lacking, SimulationError, "a node lacks the Python module foretrace: install"),
         (full, SimulationError, "No space left on device at /scratch/shard; finished work is kept"),
     ],
 )
@@ -172,6 +182,8 @@ def test_a_clock_ahead_is_refused():
         ("somewhere", "cluster 'somewhere': give HOST:PORT, ray://HOST:PORT, or local:N"),
         ("local:0", "cluster 'local:0': give"),
         ("local:many", "cluster 'local:many': give"),
+        ("local:999999", "cluster 'local:999999': give local:N with N from 1 to 1024"),
+        ("http://127.0.0.1:22", "cluster 'http://127.0.0.1:22': give HOST:PORT"),
         ("host:99999", "cluster 'host:99999': give"),
         ("127.0.0.1:9", r"cannot be reached \(Connection refused\): start it with `ray start --head`"),
         ("ray://host.invalid:10001", "cluster ray://host.invalid:10001 cannot be reached"),

@@ -275,7 +275,7 @@ def flip_a_bit(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (Path.unlink, r"shard .*shard-00001\.parquet cannot be read.*foretrace data"),
+        (Path.unlink, r"shard .*shard-00001\.parquet cannot be read.*; repeat the same `foretrace simulate`"),
         (flip_a_bit, r"shard .*shard-00001\.parquet is corrupt.*foretrace data"),
         (lambda path: os.truncate(path, 100), r"shard .*shard-00001\.parquet is corrupt"),
     ],

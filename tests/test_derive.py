@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from rich.console import Console
 
@@ -127,6 +128,44 @@ def test_shards_of_another_version_are_refused(sources, tmp_path):
     assert not (tmp_path / "all").exists()
 
 
+def test_ids_that_repeat_are_refused(sources, tmp_path):
+    derive.sample(sources / "more", tmp_path / "odd", 5)
+    name = storage.shard_name(0)
+    table, _ = storage.read_shard(tmp_path / "odd", name)
+    table = table.set_column(0, "id", pa.array([0] * table.num_rows, pa.int64()))
+    manifest = storage.read_manifest(tmp_path / "odd")
+    manifest["shards"][name] = storage.write_shard(tmp_path / "odd", name, table)
+    storage.write_manifest(tmp_path / "odd", manifest)
+    for make in (
+        lambda out: derive.merge([tmp_path / "odd", sources / "other"], out),
+        lambda out: derive.sample(tmp_path / "odd", out, 2),
+        lambda out: derive.split(tmp_path / "odd", out, (0.5, 0.5)),
+    ):
+        with pytest.raises(DatasetError, match="does not have each id from 0 to 3 once"):
+            make(tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_was_made_is_made_again(sources, tmp_path):
+    few, other = tmp_path / "few", sources / "other"
+    derive.sample(sources / "few", few, 6)
+    (few / storage.shard_name(1)).unlink()
+    with pytest.raises(DatasetError, match=r"cannot be read .*; sample again into a new folder, or restore"):
+        derive.merge([few, other], tmp_path / "new")
+    (found,) = examine(few).findings
+    assert found.problem.endswith("sample again into a new folder, or restore a copy")
+    repaired = examine(few, repair=True).findings
+    assert "removed from the manifest: sample again" in repaired[0].problem
+    with pytest.raises(DatasetError, match="few lacks 1 of 2 shards: sample again"):
+        derive.merge([few, other], tmp_path / "new")
+    (few / storage.shard_name(0)).write_bytes(b"")
+    examine(few, repair=True)
+    with pytest.raises(DatasetError, match="few is empty: sample again"):
+        derive.sample(few, tmp_path / "new", 2)
+    with pytest.raises(DatasetError, match="holds a data set that `foretrace data sample` made"):
+        collect(CollectConfig(objects=1), few, 1, Console(quiet=True), fake_trial)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -136,9 +175,18 @@ def test_shards_of_another_version_are_refused(sources, tmp_path):
         ("split {s}/more --out {t}/new --shares 0.5 0.6", "shares [0.5, 0.6]: give two or more positive"),
         (
             "split {s}/more --out {t}/new --shares 0.5 0.5 --names a a",
-            "names ['a', 'a']: give a folder's name",
+            "names ['a', 'a']: give 2 different names of folders",
         ),
-        ("split {s}/more --out {t}/new --shares 0.5 0.5 --names a ../b", "give a folder's name"),
+        (
+            "split {s}/more --out {t}/new --shares 0.5 0.5 --names a ../b",
+            "give 2 different names of folders, without a path",
+        ),
+        ("merge --out {t}/new", "no data sets to merge: give two or more"),
+        (
+            "split {s}/few --out {t}/new",
+            "few has 1 object for 3 parts: divide them with --by interaction, or give fewer shares",
+        ),
+        ("mrege {s}/more {s}/other --out {t}/new", "unknown command 'data mrege': did you mean data merge?"),
         ("split {s}/more --out {t}/new --shares 0.1 0.9", "part train of 2 objects would be empty"),
         (
             "sample {s}/more --out {t}/new --number 1000",

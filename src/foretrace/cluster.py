@@ -6,6 +6,7 @@ that every node has at the same place.
 
 import os
 import platform
+import re
 import signal
 import socket
 import time
@@ -17,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from foretrace.errors import ForetraceError, is_whole, shown
+from foretrace.errors import ForetraceError, counted, is_whole, shown
 from foretrace.extras import named_extras
 from foretrace.files import versions_of
 
@@ -48,6 +49,8 @@ QUIET = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
 """Variables of the environment that keep Ray from reporting to its makers, and from talking."""
+LACKING = re.compile(r"No module named '([^']+)'")
+"""What Python says on a node where something is not installed."""
 TOKENS = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -82,7 +85,7 @@ class Cluster:
 
     def __str__(self) -> str:
         repeated = f", {self.died} repeated" if self.died else ""
-        return f"{self.nodes} node{'s'[: self.nodes != 1]}{repeated}"
+        return f"{counted(self.nodes, 'node')}{repeated}"
 
     def run(
         self,
@@ -135,6 +138,13 @@ class Cluster:
                             ) from reason
                         waiting.appendleft(number)
                         continue
+                    except ray.exceptions.RayTaskError as reason:
+                        if lacking := LACKING.search(str(reason)):
+                            raise error(
+                                f"a node lacks the Python module {lacking[1]}: install foretrace, with the same "
+                                "extras, on every node, and start Ray from that environment"
+                            ) from None
+                        raise
                     if not ordered:
                         yield result
                         continue
@@ -182,7 +192,10 @@ def _connect(address: str) -> tuple[Any, tuple[str, int]]:
     """
     own, where = address.startswith(LOCAL), address.removeprefix(CLIENT)
     host, colon, port = where.rpartition(":")
-    if not colon or not port.isdecimal() or not is_whole(int(port), 1, MOST_LOCAL if own else 65535):
+    whole = port.isdecimal() and is_whole(int(port), 1, MOST_LOCAL if own else 65535)
+    if own and not whole:
+        raise ForetraceError(f"cluster {shown(address)}: give {LOCAL}N with N from 1 to {MOST_LOCAL}")
+    if not colon or not whole or "/" in host:
         raise ForetraceError(f"cluster {shown(address)}: {ADDRESSES}")
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
     if not own:
@@ -208,10 +221,13 @@ def _connect(address: str) -> tuple[Any, tuple[str, int]]:
             ray.init(**settings)
         except Exception as reason:  # Ray has many kinds, of which some are RuntimeErrors
             cause = next((line for line in str(reason).splitlines() if line.strip()), type(reason).__name__)
-            raise ForetraceError(
-                f"cluster {address} cannot be used ({cause.strip()}): check that Ray {ray.__version__} runs there "
-                "(`ray status`), and that this machine belongs to it or the address begins with ray://"
-            ) from reason
+            remedy = (
+                "give fewer processes, or leave --cluster out"
+                if own
+                else f"check that Ray {ray.__version__} runs there (`ray status`), and that this machine belongs to it "
+                "or the address begins with ray://"
+            )
+            raise ForetraceError(f"cluster {address} cannot be used ({cause.strip()}): {remedy}") from reason
     if not own:
         return ray, (host.strip("[]"), int(port))
     host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")

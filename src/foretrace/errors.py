@@ -188,6 +188,11 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words: "no shards", "1 shard", "2 shards"."""
+    return f"{number or 'no'} {noun}{'s'[: number != 1]}"
+
+
 @lru_cache
 def wrong_type(error: type[ForetraceError]) -> type[ForetraceError]:
     """The class of those errors of a kind that are TypeErrors, too, as Python has it for a value of a wrong type."""

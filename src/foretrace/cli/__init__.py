@@ -11,11 +11,12 @@ import sys
 import threading
 import warnings
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 import foretrace
 from foretrace.cli.console import say
 from foretrace.cli.parsing import Command, Entry, Group, Ready, parse
-from foretrace.errors import ForetraceError
+from foretrace.errors import CommandError, ForetraceError, shown
 from foretrace.extras import missing_extra
 
 LEARN, SEE, HAND_ON = "simulate, learn, predict", "cameras and recordings", "other programs and robots"
@@ -127,6 +128,12 @@ def read(arguments: Sequence[str]) -> Ready:
     about = "Predict how an object will move before the robot touches it."
     if (name := "-".join(arguments[:2])) in COMMANDS:  # `data merge` is data-merge
         arguments = [name, *arguments[2:]]
+    elif arguments[:1] == ["data"] and len(arguments) > 1 and not os.path.exists(arguments[1]):
+        parts = [name.removeprefix("data-") for name in COMMANDS if name.startswith("data-")]
+        if close := get_close_matches(arguments[1], parts, n=1, cutoff=0.75):
+            raise CommandError(
+                f"unknown command {shown(f'data {arguments[1]}')}: did you mean data {close[0]}?"
+            )
     return parse(COMMANDS, arguments, "foretrace", about)
 
 

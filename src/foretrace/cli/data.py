@@ -6,7 +6,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from foretrace.cli.console import print_outcomes, when_interrupted
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, counted
 from foretrace.files import write_json
 from foretrace.interactions import derive
 from foretrace.interactions.dataset import Dataset
@@ -19,7 +19,7 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
     """Describe a data set and check it: checksums, schema, numbers, ids.
 
     Outcomes, how far objects were lifted, what varies, and everything that is wrong. The exit status is 1 if something
-    is left to mend.
+    is left to mend. `foretrace data merge`, `data split` and `data sample` make data sets of others.
 
     Args:
         path: Folder of the data set.
@@ -29,7 +29,7 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
         out: JSON file for the description.
     """
     if upgrade:
-        print(f"{path}: {upgrade_in_place(path) or 'no'} interactions upgraded")
+        print(f"{path}: {counted(upgrade_in_place(path), 'interaction')} upgraded")
     diagnosis = examine(path, repair)
     left = sum(not finding.repaired for finding in diagnosis.findings)
     try:
@@ -45,15 +45,18 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
             write_json(out, description, indent=2)
     for finding in diagnosis.findings:
         print(f"{'repaired' if finding.repaired else 'found'}: {finding.file}: {finding.problem}")
-    print(f"{path}: {diagnosis.num_interactions} interactions, {left or 'no'} problem{'s'[: left != 1]} left")
+    print(f"{path}: {counted(diagnosis.num_interactions, 'interaction')}, {counted(left, 'problem')} left")
     return int(left > 0)
 
 
 def _print_description(description: dict) -> None:
     print_outcomes(description["outcomes"])
-    if len(kinds := description["outcomes_by_kind"]) > 1:
-        for kind, counts in kinds.items():
-            print(f"{kind:>10}: " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    for groups in (description["outcomes_by_action"], description["outcomes_by_kind"]):
+        for name, counts in groups.items() if len(groups) > 1 else ():
+            print(
+                f"{name:>10} {sum(counts.values()):7d}: "
+                + ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+            )
     for name, (low, high) in description["varies"].items():
         print(f"{name.replace('_', ' '):>42} {low:10.4g} to {high:.4g}")
     for name, value in description.items():
@@ -76,8 +79,8 @@ def merge(paths: Positional[tuple[Path, ...]], out: Path, skip_duplicates: bool 
     """
     with when_interrupted(NOTHING_LEFT):
         rows, skipped = derive.merge(paths, out, skip_duplicates)
-    left_out = f", {skipped} duplicates left out" if skipped else ""
-    print(f"data set: {out}, {rows} interactions{left_out}")
+    left_out = f", {counted(skipped, 'duplicate')} left out" if skipped else ""
+    print(f"data set: {out}, {counted(rows, 'interaction')}{left_out}")
 
 
 def split(
@@ -101,7 +104,7 @@ def split(
     with when_interrupted(NOTHING_LEFT):
         counts = derive.split(path, out, shares, names, by, seed)
     for name, rows in counts.items():
-        print(f"data set: {out / name}, {rows} interactions")
+        print(f"data set: {out / name}, {counted(rows, 'interaction')}")
 
 
 def sample(path: Positional[Path], out: Path, number: int, seed: int = 0) -> None:
@@ -115,7 +118,7 @@ def sample(path: Positional[Path], out: Path, number: int, seed: int = 0) -> Non
     """
     with when_interrupted(NOTHING_LEFT):
         rows = derive.sample(path, out, number, seed)
-    print(f"data set: {out}, {rows} interactions")
+    print(f"data set: {out}, {counted(rows, 'interaction')}")
 
 
 def show(

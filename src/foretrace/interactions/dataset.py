@@ -84,7 +84,7 @@ class Dataset:
         if missing := storage.missing_shards(manifest):
             warnings.warn(
                 f"{path} is not finished: {len(missing)} of {len(missing) + len(shards)} shards are missing; "
-                "the same `foretrace simulate` command goes on where it stopped",
+                + storage.how_to_restore(path),
                 stacklevel=2,
             )
         if shards.fit:

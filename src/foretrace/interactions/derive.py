@@ -7,7 +7,6 @@ set it comes from.
 
 import hashlib
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from foretrace.errors import DatasetError, is_number, is_whole, shown
+from foretrace.errors import DatasetError, counted, is_number, is_whole, shown
 from foretrace.files import as_path, atomic_folder, make_folder
 from foretrace.interactions import storage
 from foretrace.interactions.recorded import CONFIGURATION
@@ -29,7 +28,7 @@ TRIAL = [name for name in storage.SCHEMA.names if name not in ("id", "object_id"
 SOURCES = "sources"
 """Entry of the configuration that says what a data set was made of."""
 MADE = "made"
-"""Entry that says how."""
+"""Entry that says how; `storage.Configuration` has it, too."""
 MERGED, SPLIT, SAMPLED = "merged", "split", "sampled"
 PARTS = ("train", "validation", "test")
 
@@ -49,15 +48,27 @@ class _Source:
             raise DatasetError(
                 f"{path} holds recordings, which stay with their notes: merge them by importing into one folder"
             )
-        if missing := storage.missing_shards(manifest):
-            warnings.warn(f"{path} is not finished: {len(missing)} shards are missing", stacklevel=4)
+        remedy = storage.how_to_restore(path)
+        if not manifest["shards"]:
+            raise DatasetError(f"{path} is empty: {remedy}")
+        if missing := len(storage.missing_shards(manifest)):
+            total = counted(missing + len(manifest["shards"]), "shard")
+            raise DatasetError(f"{path} lacks {missing} of {total}: {remedy}")
         return cls(path, manifest)
 
     def shards(self, columns: list[str] | None = None) -> Iterator[pa.Table]:
         """The rows of each shard, verified."""
-        for name, entry in sorted(self.manifest["shards"].items()):
+        start = 0
+        for name, entry in sorted(self.manifest["shards"].items(), key=lambda item: (len(item[0]), item[0])):
             table, _ = storage.read_shard(self.path, name, entry.get("sha256"), columns=columns)
             check_shard(table, str(self.path / name), entry.get("rows"))
+            stop = min(start + self.manifest["shard_size"], self.manifest["num_trials"])
+            if "id" in table.column_names and sorted(table["id"].to_pylist()) != list(range(start, stop)):
+                raise DatasetError(
+                    f"shard {self.path / name} does not have each id from {start} to {stop - 1} once: "
+                    f"`foretrace data {self.path}` lists all faults"
+                )
+            start = stop
             yield table
 
     def column(self, name: str) -> np.ndarray:
@@ -135,7 +146,7 @@ def merge(paths: Sequence[str | Path], out: str | Path, skip_duplicates: bool = 
         DatasetError: A data set cannot be read, or has an interaction of another one.
     """
     if len(paths) < 2:
-        raise DatasetError(f"{len(paths)} data set to merge: give two or more")
+        raise DatasetError(f"{counted(len(paths), 'data set')} to merge: give two or more")
     sources = [_Source.open(path) for path in paths]
     out = _new_folder(out)
     seen: dict[bytes, tuple[int, int]] = {}
@@ -191,7 +202,7 @@ def split(
         raise DatasetError(f"shares {shown(list(shares))}: give two or more positive numbers that sum to 1")
     if len(names) != len(shares) or len(set(names)) < len(names) or not all(map(_is_name, names)):
         raise DatasetError(
-            f"names {shown(list(names))}: give a folder's name for each of {len(shares)} shares"
+            f"names {shown(list(names))}: give {len(shares)} different names of folders, without a path"
         )
     if by not in ("object", "interaction"):
         raise DatasetError(f"split by {shown(by)}: choose from object, interaction")
@@ -200,8 +211,15 @@ def split(
     choices = np.random.default_rng(_seed(seed)).permutation(np.unique(units))
     ends = np.round(np.cumsum(shares) * len(choices)).astype(int)
     drawn = np.split(choices, ends[:-1])
+    if len(choices) < len(shares):
+        remedy = "divide them with --by interaction, or give" if by == "object" else "give"
+        raise DatasetError(
+            f"{path} has {counted(len(choices), by)} for {len(shares)} parts: {remedy} fewer shares"
+        )
     if empty := [name for name, part in zip(names, drawn, strict=True) if len(part) == 0]:
-        raise DatasetError(f"part {empty[0]} of {len(choices)} {by}s would be empty: give it a larger share")
+        raise DatasetError(
+            f"part {empty[0]} of {counted(len(choices), by)} would be empty: give it a larger share"
+        )
     masks = {name: np.isin(units, part) for name, part in zip(names, drawn, strict=True)}
     out = _new_folder(out)
     with atomic_folder(out) as draft:

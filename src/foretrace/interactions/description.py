@@ -20,10 +20,10 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         dataset: The interactions.
 
     Returns:
-        ``outcomes`` (counts), ``outcomes_by_kind`` (the same for each kind of object), ``interactions``, ``varies``
-        (least and greatest value of what is not the same in all interactions: constants, execution error, height and
-        bevel; SI units),
-        ``fell_off_the_table`` (count), ``median_rolled_cm`` (distance that the rolled ones went, if there are any), and
+        ``outcomes`` (counts), ``outcomes_by_kind`` (the same for each kind of object), ``outcomes_by_action`` (the same
+        for each action), ``interactions``, ``varies`` (least and greatest value of what is not the same in all
+        interactions: constants, execution error, height and bevel; SI units), ``fell_off_the_table`` (count),
+        ``median_rolled_cm`` (distance that the rolled ones went, if there are any), and
         for the levered ones: ``median_final_tilt_deg``,
         ``median_final_rise_cm`` of the centre of mass, ``median_slide_mm`` of the centre of mass along the table before
         the lift, ``largest_path_error_mm`` of the blade, ``two_support_corners`` (share of lever-ups with exactly two
@@ -34,9 +34,13 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     rows = [_describe(interaction) for interaction in dataset[outcome == Outcome.LEVERED]]
     shapes = [(obj["kind"], obj.get("height"), obj.get("bevel")) for obj in dataset.objects()]
     kinds = np.array([kind for kind, _, _ in shapes])
+    actions = dataset.index["action"].to_numpy()
     figures: dict[str, Any] = {
         "outcomes": dataset.outcomes(),
         "outcomes_by_kind": {str(kind): dataset[kinds == kind].outcomes() for kind in np.unique(kinds)},
+        "outcomes_by_action": {
+            str(action): dataset[actions == action].outcomes() for action in np.unique(actions)
+        },
         "interactions": len(dataset),
         "varies": _ranges(dataset, shapes),
         "fell_off_the_table": dataset.index["fall_index"].drop_null().length(),

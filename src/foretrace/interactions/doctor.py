@@ -92,7 +92,9 @@ def _examine(path: Path, repair: bool) -> Diagnosis:
             if repair:
                 shards[name] = storage.shard_entry(content, table)
     if manifest is not None:
-        findings += _unsound_ids(tables, manifest)
+        reported = {finding.file for finding in findings if not finding.repaired} - tables.keys()
+        problems = _unsound_ids(tables, manifest, storage.how_to_restore(path))
+        findings += [problem for problem in problems if problem.file not in reported]
         findings += (
             _unsound_notes(path, tables) if manifest["configuration"] == recorded.CONFIGURATION else []
         )
@@ -111,9 +113,11 @@ def _stray_files(path: Path, repair: bool) -> Iterator[Finding]:
 def _set_aside(path: Path, name: str, shards: dict, problem: str, repair: bool) -> Finding:
     if repair:
         shards.pop(name, None)
+        done = "removed from the manifest"
         if (path / name).exists():
             (path / name).replace(path / f"{name}.corrupt")
-        problem = f"{problem.split(';')[0]}; set aside, `foretrace simulate` makes it again"
+            done = "set aside"
+        problem = f"{problem.split(';')[0]}; {done}: {storage.how_to_restore(path)}"
     return Finding(name, problem, repair)
 
 
@@ -165,7 +169,7 @@ def _unsound_notes(path: Path, tables: dict[str, pa.Table]) -> Iterator[Finding]
                 yield Finding(f"{recorded.NOTES_FOLDER}/{id:05d}.json", str(error))
 
 
-def _unsound_ids(tables: dict[str, pa.Table], manifest: dict) -> Iterator[Finding]:
+def _unsound_ids(tables: dict[str, pa.Table], manifest: dict, remedy: str) -> Iterator[Finding]:
     """Duplicate ids, ids in the wrong shard, and shards that are still to come."""
     size, num_trials = manifest["shard_size"], manifest["num_trials"]
     starts = {storage.shard_name(k): start for k, start in enumerate(range(0, num_trials, size))}
@@ -181,4 +185,4 @@ def _unsound_ids(tables: dict[str, pa.Table], manifest: dict) -> Iterator[Findin
             yield Finding(name, f"its ids do not run from {starts[name]} on without gaps")
     for name in starts:
         if name not in tables:
-            yield Finding(name, "not there; the same `foretrace simulate` command makes it")
+            yield Finding(name, f"not there; {remedy}")

@@ -39,9 +39,7 @@ def kept_index(
         f"{storage.SHARD_FOLDER}/{file.name}" for file in (folder / storage.SHARD_FOLDER).glob("*.parquet")
     }
     if absent := next((name for name, _ in entries if name not in there), None):
-        raise DatasetError(
-            f"shard {folder / absent} is missing: the same `foretrace simulate` makes it again"
-        )
+        raise DatasetError(f"shard {folder / absent} is missing: {storage.how_to_restore(folder)}")
     kept, covered = _read(folder, columns)
     if kept is not None and list(covered) == [(name, entry.get("sha256")) for name, entry in entries]:
         return kept, list(covered.values())

@@ -57,9 +57,7 @@ def check_shard(table: pa.Table, name: str, rows: int | None) -> None:
     Raises:
         DatasetError: Naming the first row with a fault.
     """
-    remedy = (
-        "`foretrace data` lists all faults; remove the file and simulate again, or restore it from a copy"
-    )
+    remedy = "`foretrace data` lists all faults; restore the file from a copy, or make the data set again"
     if rows not in (None, table.num_rows):
         raise DatasetError(f"shard {name} has {table.num_rows} rows, the manifest says {rows}: {remedy}")
     if fault := next(find_faults(table), None):

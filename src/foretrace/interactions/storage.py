@@ -8,6 +8,7 @@ Positions and angles are kept as float64, exactly as observed; the height map in
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
@@ -31,7 +32,8 @@ MANIFEST = "manifest.json"
 SHARD_FOLDER = "shards"
 HEIGHT_STEP = 1e-4
 """Resolution of stored height maps [m]."""
-
+COMMANDS = {"merged": "merge", "split": "split", "sampled": "sample"}
+"""Command of `foretrace data` that makes data sets of others, by what it notes in the configuration."""
 MOST_SHARDS = 1_000_000
 """A data set that asks for more shards is a mistake."""
 
@@ -45,6 +47,8 @@ class Configuration(TypedDict, total=False):
     """Parameters of the tool's path."""
     simulation: dict[str, Any]
     """How each action was simulated."""
+    made: dict[str, Any]
+    """How it was made of other data sets: ``how`` is merged, split or sampled."""
 
 
 class ShardEntry(TypedDict, total=False):
@@ -238,8 +242,7 @@ def unpack_masks(packed: Sequence[bytes]) -> np.ndarray:
 
 def unpack_heights(packed: Sequence[bytes]) -> np.ndarray:
     """(n, 128, 128) float32 height maps [m] from their stored form."""
-    steps = np.frombuffer(b"".join(packed), dtype="<u2")
-    return _HEIGHTS[steps].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
+    return _HEIGHTS[np.frombuffer(b"".join(packed), dtype="<u2")].reshape(len(packed), VIEW_SIZE, VIEW_SIZE)
 
 
 def to_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
@@ -292,25 +295,26 @@ def read_shard(
         DatasetError: The file is missing, damaged, or of another schema.
     """
     path = folder / name
-    remedy = f"`foretrace data {folder} --repair` sets it aside, then `foretrace simulate` makes it again"
+
+    def damaged(problem: str) -> DatasetError:
+        return DatasetError(f"shard {path} {problem}; {how_to_restore(folder, path.is_file())}")
+
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DatasetError(f"shard {path} cannot be read ({error.strerror}); {remedy}") from error
+        raise damaged(f"cannot be read ({error.strerror})") from error
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-        raise DatasetError(f"shard {path} is corrupt: its checksum is not the manifest's; {remedy}")
+        raise damaged("is corrupt: its checksum is not the manifest's")
     try:
         # In this thread: another may let go of Python's bytes later than the interpreter can bear, when it ends.
         file = pq.ParquetFile(pa.BufferReader(content))
-        found_schema = file.schema_arrow
         table = file.read(columns=None if columns is None else list(columns), use_threads=False)
     except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise DatasetError(f"shard {path} is not readable Parquet ({reason}); {remedy}") from error
-    if schema is not None and not found_schema.equals(schema):
-        found, wanted = ({field.name: field.type for field in each} for each in (found_schema, schema))
+        raise damaged(f"is not readable Parquet ({str(error).splitlines()[0]})") from error
+    if schema is not None and not file.schema_arrow.equals(schema):
+        found, wanted = ({field.name: field.type for field in each} for each in (file.schema_arrow, schema))
         odd = ", ".join(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
-        raise DatasetError(f"shard {path} has another schema (differs in {odd}); {remedy}")
+        raise damaged(f"has another schema (differs in {odd})")
     return table, content
 
 
@@ -342,8 +346,7 @@ def new_manifest(
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Replace the manifest, atomically; shards in the order of their names, whichever was finished first."""
-    shards = dict(sorted(manifest["shards"].items()))
-    write_json(folder / MANIFEST, {**manifest, "shards": shards})
+    write_json(folder / MANIFEST, {**manifest, "shards": dict(sorted(manifest["shards"].items()))})
 
 
 def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
@@ -380,6 +383,15 @@ def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
             f"{MOST_SHARDS} shards: {remedy}"
         )
     return dict(manifest)
+
+
+def how_to_restore(folder: Path, damaged: bool = False) -> str:
+    """What to do about a shard that is lost, or there and damaged."""
+    with suppress(DatasetError):
+        if made := read_manifest(folder)["configuration"].get("made"):
+            return f"{COMMANDS.get(str(made.get('how')), 'make')} again into a new folder, or restore a copy"
+    first = f"set it aside with `foretrace data {folder} --repair`, then " if damaged else ""
+    return f"{first}repeat the same `foretrace simulate` command"
 
 
 def missing_shards(manifest: Mapping[str, Any]) -> list[str]:

@@ -219,6 +219,11 @@ def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[s
         storage.write_manifest(out, manifest)
         return manifest
     manifest = storage.read_manifest(out)
+    if made := manifest["configuration"].get("made"):
+        command = storage.COMMANDS.get(str(made.get("how")), "")
+        raise DatasetError(
+            f"{out} holds a data set that `foretrace data {command}` made: choose another folder"
+        )
     found = {**manifest["configuration"], "shard_size": manifest["shard_size"]}
     if different := first_difference(found, {**wanted, "shard_size": SHARD_SIZE}):
         name, was, asked = different
