@@ -230,14 +230,14 @@ def test_the_list_of_commands_has_a_line_for_each(capsys):
     printed = capsys.readouterr().out
     listed = re.findall(r"^  (\S+) +\S.*$", printed, re.MULTILINE)
     assert listed == list(cli.COMMANDS)
-    assert len(listed) == 20
+    assert len(listed) == 23
     assert cli.main([]) == 2
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["levitate"], "unknown command 'levitate': choose from demo, simulate, data, train"),
+        (["levitate"], "unknown command 'levitate': choose from demo, simulate, data, data-merge"),
         (["simulat"], "unknown command 'simulat': did you mean simulate?"),
         (["export", "rosbags"], "did you mean rosbag?"),
         (["train", "--predictor", "gru"], "unknown predictor 'gru'; available: lstm, one-shot"),
