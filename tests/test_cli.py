@@ -19,10 +19,10 @@ from foretrace.interactions.dataset import Dataset
 
 @pytest.fixture
 def fake_physics(monkeypatch):
-    def fake_simulate(obj, action, config, *, seed, id):
-        return factories.fake_lever_up(obj, action, id=id, seed=seed)
+    def fake_simulate(trials):
+        return [factories.fake_lever_up(one.obj, one.action, id=one.id, seed=one.seed) for one in trials]
 
-    monkeypatch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake_simulate)
+    monkeypatch.setattr("foretrace.simulation.lever_up.simulate_trials", fake_simulate)
 
 
 @pytest.fixture

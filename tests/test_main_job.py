@@ -171,7 +171,7 @@ def test_wrong_input_is_one_clear_line(
         "cannot read an image": ["predict", str(run), "--image", *shape[1:], "--scale", "1", "--edge", "0"],
         "seed is -1": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--seed", "-1"],
         "threads is 0": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--threads", "0"],
-        "density = 1e-30": ["predict", *shape, "--edge", "0", "--compare", "--density", "1e-30"],
+        "density is 1e-30": ["predict", *shape, "--edge", "0", "--compare", "--density", "1e-30"],
         "--seconds is nan": ["capture", str(tmp_path / "film"), "--seconds", "nan"],
         "none, im-cnn": ["train", "--data", str(data), "--out", str(tmp_path / "r"), "--features", "sift"],
         str(tmp_path / "empty"): ["predict", str(tmp_path / "empty"), *shape, "--edge", "0"],

@@ -20,7 +20,7 @@ from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import NO_OFFSET, ExecutionOffset, Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import NO_BEVEL, Box, Cylinder, Prism
-from foretrace.simulation.collect import CollectConfig, collect, simulate_trial, trial
+from foretrace.simulation.collect import CollectConfig, collect, planned_trial, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.randomisation import (
     FACTORS,
@@ -39,16 +39,10 @@ PENTAGON = Prism([[0.1, 0.0], [0.02, 0.09], [-0.08, 0.05], [-0.07, -0.06], [0.04
 
 
 def fake_trial(config: CollectConfig, id: int) -> Interaction:
-    """What `simulate_trial` draws, without its physics."""
-    made = []
-
-    def fake(obj, action, config, *, seed, id, execution_error=NO_OFFSET):
-        made.append(replace(factories.fake_lever_up(obj, action, id=id, seed=seed), physics=config.physics))
-        return replace(made[0], execution_error=execution_error)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("foretrace.simulation.lever_up.simulate_lever_up", fake)
-        return simulate_trial(config, id)
+    """What is drawn for a trial, without its physics."""
+    one = planned_trial(config, id)
+    made = factories.fake_lever_up(one.obj, one.action, id=id, seed=one.seed)
+    return replace(made, physics=one.config.physics, execution_error=one.execution_error)
 
 
 def drawn(randomisation: Randomisation, seed: int) -> dict[str, float]:
