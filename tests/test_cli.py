@@ -78,7 +78,7 @@ def test_simulate_takes_recipes_and_watches_solids_longer(fake_physics, tmp_path
     assert configuration["simulation"]["watch_time"] == 1.5
     assert configuration["simulation"]["physics"]["table_edge"] == 0.3
     assert cli.main(["data", str(tmp_path / "mixed")]) == 0
-    assert "cylinder: 8 levered" in capsys.readouterr().out
+    assert re.search(r"cylinder +8: 8 levered", capsys.readouterr().out)
     assert cli.main([*begun, str(tmp_path / "paper")]) == 0
     assert storage.read_manifest(tmp_path / "paper")["configuration"]["simulation"]["watch_time"] == 0
     capsys.readouterr()
