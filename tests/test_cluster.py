@@ -161,12 +161,13 @@ def test_errors_of_jobs_arrive(begin, function, error, message):
     [
         ({"versions": {**HERE, "foretrace": "9.9"}}, "has foretrace .*, this machine 9.9: install the same"),
         ({"versions": {**HERE, "data set format": "3"}}, "has data set format 2, this machine 3"),
-        ({"sent": time.time() + 9000}, "is 2.5 h behind this machine's"),
+        ({"ahead": 9001.0}, "is 2.5 h behind this machine's"),
         ({"folder": Path("/nowhere/at/all")}, "has no folder /nowhere/at/all .*: share it"),
     ],
 )
 def test_nodes_that_do_not_fit_are_refused(changed, message):
-    given = {"function": double, "job": 1, "folder": Path.cwd(), "versions": HERE, "sent": time.time()}
+    sent = time.time() + changed.pop("ahead", 0.0)
+    given = {"function": double, "job": 1, "folder": Path.cwd(), "versions": HERE, "sent": sent}
     with pytest.raises(SimulationError, match=message):
         cluster._opened(cluster._work(**given | changed), SimulationError)
 
