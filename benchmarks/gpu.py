@@ -68,7 +68,7 @@ def rate(objects: int, recipe: str) -> dict[str, object]:
         "lever_ups": num,
         "seconds": round(seconds, 1),
         "lever_ups_per_hour": round(3600 * num / seconds),
-        "steps_per_second": round(num * 1475 / seconds),
+        "steps_per_second": round(num * trial(config, 0)[1].duration / config.simulation.timestep / seconds),
         "bytes_per_lever_up": round(size / num),
     }
 

@@ -83,11 +83,8 @@ class MujocoEngine(Engine):
         physics: Physics,
     ) -> Motion:
         """Plays an action in one call of ``mujoco.rollout``."""
-        num_samples = round(duration / self.sample_period)
         stride = round(self.sample_period / self.timestep)
-        samples = sample_tool(tool_motion, np.arange(num_samples + 1) * self.sample_period)
-        plan = plan_arm if self.embodiment == "arm" else plan_carriage
-        control = plan(tool_motion, samples, tool, num_samples * stride, self.timestep)
+        control = self._control(tool, tool_motion, duration)
         model, data = self._compiled(obj, physics, tool, control.coordinates)
         mujoco.mj_resetData(model, data)
         data.qpos[:7] = matrix_to_pose(T_action_object @ planar_transform(body_origin(obj), 0.0))
@@ -97,6 +94,14 @@ class MujocoEngine(Engine):
         states, _ = rollout.rollout(model, data, initial_state=state[None], control=control.setpoints[None])
         seen = np.vstack([state[None], np.asarray(states)[0, stride - 1 :: stride]])
         return self._observe(model, data, seen, control)
+
+    def _control(self, tool: Tool, tool_motion: ToolMotion, duration: float) -> ControlPath:
+        """Set points of an action."""
+        num_samples = round(duration / self.sample_period)
+        samples = sample_tool(tool_motion, np.arange(num_samples + 1) * self.sample_period)
+        plan = plan_arm if self.embodiment == "arm" else plan_carriage
+        steps = num_samples * round(self.sample_period / self.timestep)
+        return plan(tool_motion, samples, tool, steps, self.timestep)
 
     def _compiled(
         self, obj: ObjectModel, physics: Physics, tool: Tool, coordinates: tuple[int, ...]

@@ -21,8 +21,8 @@ from foretrace.extras import named_extras
 from foretrace.geometry import matrix_to_pose, planar_transform
 from foretrace.interactions.record import Physics
 from foretrace.objects import HullShape, ObjectModel
-from foretrace.simulation.engine import Play, sample_tool
-from foretrace.simulation.mujoco_engine import ControlPath, MujocoEngine, plan_carriage
+from foretrace.simulation.engine import Play
+from foretrace.simulation.mujoco_engine import ControlPath, MujocoEngine
 from foretrace.simulation.scene import body_origin, build_scene
 
 BATCHED = (
@@ -46,7 +46,7 @@ GEOM_FIELDS = (
 )
 """Fields of a collision shape that differ between worlds."""
 CONTACTS = (4, 16)
-"""Room for contacts: for each piece of an object, and besides."""
+"""Room for contacts: for each collision shape, and besides."""
 
 
 class WarpEngine(MujocoEngine):
@@ -105,7 +105,7 @@ class WarpEngine(MujocoEngine):
         """
         for play in plays:
             self.check_physics(play.physics)
-        controls = [self._control(play) for play in plays]
+        controls = [self._control(play.tool, play.tool_motion, play.duration) for play in plays]
         groups: dict[Any, list[int]] = {}
         for row, (play, control) in enumerate(zip(plays, controls, strict=True)):
             groups.setdefault((play.tool, control.coordinates), []).append(row)
@@ -118,12 +118,6 @@ class WarpEngine(MujocoEngine):
                 motions[row] = self._observe(model, data, samples[: len(control.tips)], control)
         return [motions[row] for row in range(len(plays))]
 
-    def _control(self, play: Play) -> ControlPath:
-        num_samples = round(play.duration / self.sample_period)
-        samples = sample_tool(play.tool_motion, np.arange(num_samples + 1) * self.sample_period)
-        steps = num_samples * round(self.sample_period / self.timestep)
-        return plan_carriage(play.tool_motion, samples, play.tool, steps, self.timestep)
-
     def _step(
         self, plays: Sequence[Play], controls: Sequence[ControlPath]
     ) -> Float[np.ndarray, "world sample state"]:
@@ -131,8 +125,7 @@ class WarpEngine(MujocoEngine):
         mjw, wp = import_module("mujoco_warp"), import_module("warp")
         template, fields = self._worlds(plays, controls[0].coordinates)
         num, stride = len(plays), round(self.sample_period / self.timestep)
-        pieces = template.ngeom
-        room = CONTACTS[0] * pieces + CONTACTS[1]
+        room = CONTACTS[0] * template.ngeom + CONTACTS[1]
         start = np.array(
             [
                 [
@@ -202,13 +195,13 @@ class WarpEngine(MujocoEngine):
                 )
         template = spec.compile()
         # The table comes first, then the pieces, then the tool.
-        absent = template.ngeom
+        shapes = template.ngeom
         values: dict[str, list[np.ndarray]] = {name: [] for name in (*BATCHED, *GEOM_FIELDS)}
         numbers = {key: number for number, key in enumerate(objects)}
         for play in plays:
             model, _ = self._compiled(play.obj, play.physics, play.tool, coordinates)
             count = len(_hulls(play.obj))
-            missing = absent - model.ngeom
+            missing = shapes - model.ngeom
             for name in BATCHED:
                 values[name].append(np.array(getattr(model, name)))
             for name in GEOM_FIELDS:
@@ -222,7 +215,7 @@ class WarpEngine(MujocoEngine):
                 )
                 values[name].append(np.concatenate([own[: 1 + count], filler, own[1 + count :]]))
         stacked = {name: np.stack(rows) for name, rows in values.items()}
-        stacked["geom_aabb"] = stacked["geom_aabb"].reshape(len(plays), absent, 2, 3)
+        stacked["geom_aabb"] = stacked["geom_aabb"].reshape(len(plays), shapes, 2, 3)
         return template, {
             name: rows if rows.dtype.kind == "i" else rows.astype(np.float32)
             for name, rows in stacked.items()

@@ -55,6 +55,7 @@ class SimulatedWorld:
     ) -> None:
         check_type("obj", obj, ObjectModel, SimulationError)
         check_type("config", config, SimulationConfig, SimulationError)
+        check_type("seen", seen, (ObjectModel, type(None)), SimulationError)
         self.object, self.config = obj, config
         self.T_table_object = np.eye(4)
         """The object's frame on the table."""
