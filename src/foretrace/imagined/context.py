@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import ACTIONS, Action
-from foretrace.errors import PredictionError, TrainingError, shown
+from foretrace.errors import PredictionError, TrainingError, is_number, shown
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import PHYSICS_RANGES, Physics
 
@@ -202,12 +202,12 @@ def _told(
             f"the predictor is conditioned on {accepted}, not on {shown(odd[0])}: leave it out of context"
         )
     for name, value in context.items():
-        if isinstance(value, bool | str) or not np.isscalar(value) or not np.isfinite(value):
+        if not is_number(value) or not np.isfinite(value):
             raise PredictionError(
                 f"context {name} is {shown(value)}: give a finite value {CONTEXT.get(name, 'in m')}"
             )
         low, high = PHYSICS_RANGES.get(name, (-np.inf, np.inf))
-        if not low <= value <= high:
+        if not low <= float(value) <= high:
             raise PredictionError(f"context {name} is {shown(value)}: give a value from {low:g} to {high:g}")
     if context.get(EXACT, 0) != 0:
         raise PredictionError(
