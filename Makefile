@@ -29,14 +29,14 @@ $(STAMP): pyproject.toml requirements.lock constraints.txt
 	touch $(STAMP)
 
 # After a change of the dependencies; versions that fit stay as they are. The lines of packages that torch brings on
-# machines with a GPU are left out.
+# machines with a GPU are left out, and those of the extra `warp`, which runs there.
 lock:
 	$(BIN)/pip install --quiet uv
 	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --python-version 3.11.0 --generate-hashes \
 		--constraint constraints.txt --no-emit-package torch --no-annotate --no-header --quiet \
 		--output-file requirements.lock
 	sed -i -e ':join' -e '/\\$$/{N;s/ *\\\n */ /;bjoin}' requirements.lock
-	sed -i -E '/^(nvidia|cuda|triton)-?/d' requirements.lock
+	sed -i -E '/^(nvidia|cuda|triton|mujoco-warp|warp-lang|etils|zipp)-?/d' requirements.lock
 
 # Which pinned packages have no wheel for macOS or Windows.
 wheels: setup

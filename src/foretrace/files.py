@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from foretrace.errors import ForetraceError, shown, wrong_type
 from foretrace.schema import conform, parse_json
+from foretrace.urls import Url, is_url, names_in
 
 T = TypeVar("T")
 
@@ -42,7 +43,15 @@ def as_path(path: Any, error: type[ForetraceError]) -> Path:
     """
     if not isinstance(path, str | os.PathLike):
         raise wrong_type(error)(f"{shown(path)} is no path: give the name of a file or folder")
+    if is_url(path):
+        raise error(f"{path} is a URL, and only data sets are read from and simulated to URLs: give a folder")
     return Path(path)
+
+
+def cache_folder(name: str) -> Path:
+    """Where the user's cache keeps files of a kind; it may be deleted at any time."""
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(home) if os.path.isabs(home) else Path.home() / ".cache") / "foretrace" / name
 
 
 def make_folder(folder: Path, error: type[ForetraceError]) -> None:
@@ -157,23 +166,26 @@ def _remove(file: Path) -> None:
             file.unlink(missing_ok=True)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path | Url, content: bytes) -> None:
     """Write a file so that it is either whole or absent, even after a loss of power."""
+    if isinstance(path, Url):
+        path.write_bytes(content)
+        return
     with atomic_path(path) as partial:
         partial.write_bytes(content)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path | Url, text: str) -> None:
     """Write a UTF-8 text file atomically."""
     write_bytes(path, text.encode())
 
 
-def write_json(path: Path, content: Any, indent: int = 1) -> None:
+def write_json(path: Path | Url, content: Any, indent: int = 1) -> None:
     """Write a JSON file atomically."""
     write_text(path, json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
 
 
-def read_text(path: Path, error: type[ForetraceError], remedy: str, fallback: str | None = None) -> str:
+def read_text(path: Path | Url, error: type[ForetraceError], remedy: str, fallback: str | None = None) -> str:
     """The text in a file, as editors and spreadsheets write it; line ends stay as they are.
 
     It is UTF-8, UTF-16 or UTF-32, with or without a byte order mark.
@@ -188,7 +200,7 @@ def read_text(path: Path, error: type[ForetraceError], remedy: str, fallback: st
         ForetraceError: Of the given class: the file is missing, too large, or no text.
     """
     try:
-        with open(path, "rb") as file:
+        with path.open("rb") as file:
             content = file.read(LARGEST_TEXT + 1)
     except FileNotFoundError:
         raise error(f"{path} does not exist: {remedy}") from None
@@ -208,7 +220,7 @@ def read_text(path: Path, error: type[ForetraceError], remedy: str, fallback: st
         return content.decode(fallback)
 
 
-def read_json(path: Path, schema: type[T] | Any, error: type[ForetraceError], remedy: str) -> T:
+def read_json(path: Path | Url, schema: type[T] | Any, error: type[ForetraceError], remedy: str) -> T:
     """The object in a JSON file.
 
     Args:
@@ -225,7 +237,7 @@ def read_json(path: Path, schema: type[T] | Any, error: type[ForetraceError], re
 
 
 def read_versioned(
-    path: Path,
+    path: Path | Url,
     schema: type[T] | Any,
     format: str,
     version: int,
@@ -260,7 +272,7 @@ def read_versioned(
     return conform(content, schema, str(path), error, remedy)
 
 
-def _json_object(path: Path, error: type[ForetraceError], remedy: str) -> dict[str, Any]:
+def _json_object(path: Path | Url, error: type[ForetraceError], remedy: str) -> dict[str, Any]:
     text = read_text(path, error, remedy)
     try:
         content = parse_json(text)
@@ -311,15 +323,16 @@ def partial_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.glob(f"*{PARTIAL}") if _is_left(file))
 
 
-def first_stranger(folder: Path, own: Container[str] = ()) -> str | None:
+def first_stranger(folder: Path | Url, own: Container[str] = ()) -> str | None:
     """Name of the first entry in a folder that is not the beginning of something whose entries have given names.
 
     Args:
         folder: The folder; it need not exist.
         own: Names that its entries may have, beside the lock and drafts.
     """
-    names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
-    mine = (name for name in names if name != LOCK and not (name[0] == "." and name.endswith(PARTIAL)))
+    mine = (
+        name for name in names_in(folder) if name != LOCK and not (name[0] == "." and name.endswith(PARTIAL))
+    )
     return next((name for name in mine if name not in own), None)
 
 

@@ -13,6 +13,7 @@ from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.description import describe_dataset
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.upgrade import upgrade as upgrade_in_place
+from foretrace.urls import as_place
 
 
 def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, out: Path | None = None) -> int:
@@ -22,7 +23,7 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
     is left to mend. `foretrace data merge`, `data split` and `data sample` make data sets of others.
 
     Args:
-        path: Folder of the data set.
+        path: Folder or URL of the data set.
         repair: Remove leftovers, set corrupt shards aside (`foretrace simulate` makes them again), and enter
             whole shards that miss their checksum.
         upgrade: Bring a data set of format version 1 to today's format first, in place.
@@ -30,10 +31,11 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
     """
     if upgrade:
         print(f"{path}: {counted(upgrade_in_place(path), 'interaction')} upgraded")
-    diagnosis = examine(path, repair)
+    place = as_place(path, DatasetError)
+    diagnosis = examine(place, repair)
     left = sum(not finding.repaired for finding in diagnosis.findings)
     try:
-        description = describe_dataset(Dataset.open(path))
+        description = describe_dataset(Dataset.open(place))
     except DatasetError:
         if not left:
             raise
@@ -45,7 +47,7 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
             write_json(out, description, indent=2)
     for finding in diagnosis.findings:
         print(f"{'repaired' if finding.repaired else 'found'}: {finding.file}: {finding.problem}")
-    print(f"{path}: {counted(diagnosis.num_interactions, 'interaction')}, {counted(left, 'problem')} left")
+    print(f"{place}: {counted(diagnosis.num_interactions, 'interaction')}, {counted(left, 'problem')} left")
     return int(left > 0)
 
 
@@ -73,7 +75,7 @@ def merge(paths: Positional[tuple[Path, ...]], out: Path, skip_duplicates: bool 
     Interactions and objects are numbered anew; the data sets stay as they are.
 
     Args:
-        paths: Folders of the data sets.
+        paths: Folders or URLs of the data sets.
         out: Folder of the new data set.
         skip_duplicates: Leave out interactions that were there before, instead of refusing them.
     """
@@ -94,7 +96,7 @@ def split(
     """Make several data sets of one.
 
     Args:
-        path: Folder of the data set.
+        path: Folder or URL of the data set.
         out: Folder of the new data sets.
         shares: Share of each of them; they sum to 1.
         names: Names of their folders within --out.
@@ -111,7 +113,7 @@ def sample(path: Positional[Path], out: Path, number: int, seed: int = 0) -> Non
     """Make a data set of some interactions of another one, drawn at random.
 
     Args:
-        path: Folder of the data set.
+        path: Folder or URL of the data set.
         out: Folder of the new data set.
         number: Number of interactions.
         seed: Decides which ones.
@@ -131,7 +133,7 @@ def show(
     """Draw a contact sheet of a data set, or one interaction as a picture and an animation.
 
     Args:
-        path: Folder of the data set.
+        path: Folder or URL of the data set.
         id: Number of the interaction to draw; without it, the contact sheet is drawn.
         out: File to write: .png, .svg or .pdf; with an id also .gif or .mp4. By default pictures go to the
             data set's folder figures.
@@ -150,7 +152,7 @@ def show(
         raise DatasetError(f"cannot draw to {out}: choose a name that ends in {', '.join(still + moving)}")
     if out is not None and out.suffix.lower() in moving and id is None:
         raise DatasetError(f"{out} would be an animation: choose the interaction with --id")
-    dataset = Dataset.open(path)
+    dataset = _open_to_draw(path, out)
     stem = path / "figures" / ("contact-sheet" if id is None else f"interaction-{id}")
     if out is not None:
         targets = [out]
@@ -166,6 +168,14 @@ def show(
         print(target)
 
 
+def _open_to_draw(path: Path, out: Path | None) -> Dataset:
+    """A data set whose pictures go to a file, or to its own folder."""
+    dataset = Dataset.open(path)
+    if out is None and not isinstance(dataset.path, Path):
+        raise DatasetError(f"pictures of {dataset.path} are not written there: name a file with --out")
+    return dataset
+
+
 def _show_arm(path: Path, id: int | None, out: Path | None, arm: bool, run: Path | None) -> None:
     """Render one interaction with the arm."""
     if not arm:
@@ -174,7 +184,7 @@ def _show_arm(path: Path, id: int | None, out: Path | None, arm: bool, run: Path
         raise DatasetError("--arm renders one interaction: choose it with --id")
     from foretrace.pictures.rendered import rendered_animation
 
-    dataset = Dataset.open(path)
+    dataset = _open_to_draw(path, out)
     interaction, imagined = dataset.with_id(id), None
     if run is not None:
         from foretrace.export.episodes import choose

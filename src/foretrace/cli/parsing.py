@@ -20,6 +20,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 from foretrace.errors import CommandError, shown
+from foretrace.urls import as_place, is_url
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo, StructTypeInfo
@@ -173,6 +174,12 @@ def _check_out(ready: Any, about: str) -> None:
     given = getattr(ready, "keywords", {})
     places = [given.get("out"), *(getattr(value, "out", None) for value in given.values())]
     for out in (place for place in places if isinstance(place, Path)):
+        if is_url(out):
+            if about.startswith("Folder or URL"):
+                continue
+            raise CommandError(
+                f"--out {as_place(out, CommandError)} is a URL: name a folder; only `foretrace simulate` writes to URLs"
+            )
         if out.is_file() and about.startswith("Folder"):
             raise CommandError(f"--out {out} is a file: name a folder")
         if out.is_dir() and about and not about.startswith("Folder"):

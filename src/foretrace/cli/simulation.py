@@ -9,9 +9,11 @@ from tyro.conf import OmitArgPrefixes, arg
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.cli.parsing import adapt
+from foretrace.errors import DatasetError
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED
+from foretrace.urls import as_place
 from foretrace.workers import on_cluster
 
 ROLLING_TIME = 1.5
@@ -36,7 +38,7 @@ def simulate(
     workers.
 
     Args:
-        out: Folder of the data set.
+        out: Folder or URL of the data set, as s3://BUCKET/NAME.
         config: Content of the data set.
         watch_time: Time for which the object is observed after the blade has stopped [s]; by default 0 for the paper's
             prisms, and 1.5 otherwise, since solids may roll.
@@ -47,7 +49,7 @@ def simulate(
         off_centre: Move the centre of mass of half the prisms and boxes away from the middle.
         workers: Number of processes; by default one for each core.
         cluster: Address of a Ray cluster that does the work: HOST:PORT, ray://HOST:PORT, or local:N. All nodes must
-            share the folder.
+            share the folder, or reach the URL.
     """
     if watch_time is None:
         watch_time = 0.0 if config.recipe == "paper" else ROLLING_TIME
@@ -60,10 +62,11 @@ def simulate(
         randomisation = replace(randomisation, com_offset=LARGEST_COM_OFFSET)
     simulation = replace(config.simulation, watch_time=watch_time)
     config = replace(config, simulation=simulation, randomisation=randomisation)
+    place = as_place(out, DatasetError)
     with (
-        when_interrupted(f"what is done stays in {out}, the same command goes on from there"),
+        when_interrupted(f"what is done stays in {place}, the same command goes on from there"),
         on_cluster(cluster),
     ):
-        counts = collect(config, out, workers)
+        counts = collect(config, place, workers)
     print_outcomes(counts)
-    print(f"data set: {out}")
+    print(f"data set: {place}")

@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, arg
 from foretrace import predictor as learned
 from foretrace.cli.console import when_interrupted
 from foretrace.cli.parsing import adapt
+from foretrace.errors import DatasetError
 from foretrace.features import FEATURES, FeatureExtractor
 from foretrace.files import write_text
 from foretrace.interactions.dataset import Dataset
@@ -22,6 +23,7 @@ from foretrace.predictor.config import feature_option
 from foretrace.predictor.model_card import RECALIBRATED, model_card, recalibration_section
 from foretrace.predictor.recalibration import SHOWN_LEVELS
 from foretrace.predictor.run_folder import RunFolder
+from foretrace.urls import Url, as_place
 
 CARD = "MODEL_CARD.md"
 
@@ -56,13 +58,14 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
     ) -> None:
         values = [(each, getattr(extractor, each.name)) for each in fields(extractor)]
         given = {each.metadata["name"]: value for each, value in values if value != each.default}
+        place = as_place(data, DatasetError)
         named = {word.partition("=")[0] for word in words if word.startswith("--")}
         if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
             if "--epochs" in named and "--min-steps" not in named:
                 training = replace(training, min_steps=1)  # who asks for one epoch gets one
-            _train(data, out, replace(config, feature_options=given), training, split, fresh)
+            _train(place, out, replace(config, feature_options=given), training, split, fresh)
         if card:
-            write_text(out / CARD, model_card(out, data))
+            write_text(out / CARD, model_card(out, place))
             print(out / CARD)
 
     train.__doc__ = f"""Train a predictor on a data set.
@@ -71,7 +74,7 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
     train --predictor one-shot --help` lists those of another one.
 
     Args:
-        data: Folder of the data set.
+        data: Folder or URL of the data set.
         out: Folder of the training: model, settings, metrics, split, TensorBoard events.
         config: Settings of the predictor.
         extractor: Settings of the features {features.label}; those of the predictor's --features are listed.
@@ -100,9 +103,10 @@ def recalibrate(run: Path, data: Path) -> None:
 
     Args:
         run: Folder of the training.
-        data: Folder of the data set; its predictions are tried first, with the regions as they were.
+        data: Folder or URL of the data set; its predictions are tried first, with the regions as they were.
     """
-    found = Dataset.open(data)
+    place = as_place(data, DatasetError)
+    found = Dataset.open(place)
     held = learned.recalibrate(run, found)
     levels = [f"{level:.0%}" for level in SHOWN_LEVELS]
     print(f"{'motions in regions before':28s}" + "".join(f"{level:>8s}" for level in levels))
@@ -111,7 +115,7 @@ def recalibrate(run: Path, data: Path) -> None:
     card = run / CARD
     if card.is_file():
         text = card.read_text(encoding="utf-8").partition(RECALIBRATED)[0].rstrip()
-        write_text(card, f"{text}\n\n{recalibration_section(run, data, held)}")
+        write_text(card, f"{text}\n\n{recalibration_section(run, place, held)}")
     print(run)
 
 
@@ -146,7 +150,7 @@ def _value(option: str, words: Sequence[str]) -> str | None:
 
 
 def _train(
-    data: Path,
+    data: Path | Url,
     out: Path,
     config: PredictorConfig,
     training: TrainConfig,

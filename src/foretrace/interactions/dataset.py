@@ -16,7 +16,6 @@ from jaxtyping import Float, Int
 from foretrace.actions import ACTIONS, FAILED
 from foretrace.errors import DatasetError, RowError, ShapeError, check_type, is_whole, shown
 from foretrace.extras import named_extras
-from foretrace.files import as_path
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
 from foretrace.interactions.batch import chosen_rows
@@ -26,6 +25,7 @@ from foretrace.interactions.soundness import check_shard
 from foretrace.interactions.tables import batch_of, common_times
 from foretrace.objects import ObjectModel, object_from_json
 from foretrace.schema import parse_json
+from foretrace.urls import Url, as_place, read_each
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,25 +59,25 @@ class Dataset:
         self.manifest = manifest
         """Configuration, versions, units and shards of the folder."""
         self.path = shards.path
-        """The folder that it was read from."""
+        """The folder that it was read from, or its URL."""
         self._shards, self._places = shards, places
         self._objects: dict[str, ObjectModel] = {}
 
     @classmethod
-    def open(cls, path: str | Path, failed: bool = False) -> "Dataset":
+    def open(cls, path: str | Path | Url, failed: bool = False) -> "Dataset":
         """Open a data set; checksums of all shards are verified.
 
         Of one that does not fit into memory, shards are verified when they are first seen, and when they are read: the
-        columns that are always in memory are kept beside it, in ``index.arrow``.
+        columns that are always in memory are kept beside it, in ``index.arrow``; of a URL, in the user's cache.
 
         Args:
-            path: The folder written by ``foretrace simulate``.
+            path: The folder written by ``foretrace simulate``, or its URL, as ``s3://bucket/set``.
             failed: Keep the failed simulations too; they have no effect to learn from.
 
         Raises:
             DatasetError: Nothing there, another format version, or a missing or corrupt shard.
         """
-        path = as_path(path, DatasetError)
+        path = as_place(path, DatasetError)
         check_type("failed", failed, bool, DatasetError, "True or False")
         manifest = storage.read_manifest(path)
         shards = _Shards(path, manifest["shards"])
@@ -88,7 +88,8 @@ class Dataset:
                 stacklevel=2,
             )
         if shards.fit:
-            tables = [_encoded(shards.table(k).select(INDEX_COLUMNS)) for k in range(len(shards))]
+            whole = read_each(shards.table, range(len(shards)), path)
+            tables = [_encoded(table.select(INDEX_COLUMNS)) for table in whole]
             empty = _encoded(storage.SCHEMA.empty_table().select(INDEX_COLUMNS))
             index, rows = pa.concat_tables([empty, *tables]), [table.num_rows for table in tables]
         else:
@@ -325,7 +326,7 @@ def _encoded(table: pa.Table) -> pa.Table:
 class _Shards:
     """Tables of a data set's shards, kept in memory if all of them fit; otherwise only the last one that was read."""
 
-    def __init__(self, path: Path, entries: Mapping[str, storage.ShardEntry]):
+    def __init__(self, path: Path | Url, entries: Mapping[str, storage.ShardEntry]):
         self.path = path
         self.entries = sorted(entries.items())
         self._kept: dict[int, pa.Table] = {}

@@ -20,6 +20,7 @@ from foretrace.files import as_path, atomic_folder, make_folder
 from foretrace.interactions import storage
 from foretrace.interactions.recorded import CONFIGURATION
 from foretrace.interactions.soundness import check_shard
+from foretrace.urls import Url, as_place
 
 RESULTS = ("outcome", "slip_index", "fall_index", *storage.TRAJECTORIES, "joint_trajectory", "num_joints")
 RESULTS += ("support_points", "support_corners", "path_error", "mask", "height", "metres_per_pixel")
@@ -37,12 +38,12 @@ PARTS = ("train", "validation", "test")
 class _Source:
     """A data set that is read."""
 
-    path: Path
+    path: Path | Url
     manifest: dict[str, Any]
 
     @classmethod
-    def open(cls, path: str | Path) -> "_Source":
-        path = as_path(path, DatasetError)
+    def open(cls, path: str | Path | Url) -> "_Source":
+        path = as_place(path, DatasetError)
         manifest = storage.read_manifest(path)
         if manifest["configuration"] == CONFIGURATION:
             raise DatasetError(
@@ -131,11 +132,13 @@ class _Writer:
         return self.rows
 
 
-def merge(paths: Sequence[str | Path], out: str | Path, skip_duplicates: bool = False) -> tuple[int, int]:
+def merge(
+    paths: Sequence[str | Path | Url], out: str | Path, skip_duplicates: bool = False
+) -> tuple[int, int]:
     """One data set of several.
 
     Args:
-        paths: Folders of the data sets, in the order of their interactions in the new one.
+        paths: Folders or URLs of the data sets, in the order of their interactions in the new one.
         out: Folder of the new data set; it must not exist.
         skip_duplicates: Leave out interactions that were there before, instead of refusing them.
 
@@ -172,7 +175,7 @@ def merge(paths: Sequence[str | Path], out: str | Path, skip_duplicates: bool = 
 
 
 def split(
-    path: str | Path,
+    path: str | Path | Url,
     out: str | Path,
     shares: Sequence[float],
     names: Sequence[str] = PARTS,
@@ -182,7 +185,7 @@ def split(
     """Several data sets of one.
 
     Args:
-        path: Folder of the data set.
+        path: Folder or URL of the data set.
         out: Folder of the new ones, a folder each; it must not exist.
         shares: Share of each; they sum to 1.
         names: Names of their folders.
@@ -231,11 +234,11 @@ def split(
         }
 
 
-def sample(path: str | Path, out: str | Path, number: int, seed: int = 0) -> int:
+def sample(path: str | Path | Url, out: str | Path, number: int, seed: int = 0) -> int:
     """A data set of some interactions of another one, drawn at random, in their order.
 
     Args:
-        path: Folder of the data set.
+        path: Folder or URL of the data set.
         out: Folder of the new one; it must not exist.
         number: Number of interactions.
         seed: Decides which ones.

@@ -1,5 +1,6 @@
 """Is a data set whole and sound? What is not, and what of it can be repaired."""
 
+import fnmatch
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from foretrace.interactions import recorded, storage
 from foretrace.interactions.dataset import count_outcomes
 from foretrace.interactions.soundness import find_faults
 from foretrace.objects import object_from_json
+from foretrace.urls import Url, as_place, names_in
 
 
 @dataclass(frozen=True)
@@ -41,26 +43,31 @@ class Diagnosis:
     """How often each outcome occurs, failed simulations included."""
 
 
-def examine(path: str | Path, repair: bool = False) -> Diagnosis:
+def examine(path: str | Path | Url, repair: bool = False) -> Diagnosis:
     """Check checksums, schema, numbers, ids and stray files of a data set.
 
     Args:
-        path: The data set's folder.
+        path: The data set's folder, or its URL.
         repair: Remove what an interrupted run left behind, set corrupt shards aside so that
             ``foretrace simulate`` makes them again, and enter whole shards that merely miss their checksum.
 
     Raises:
         DatasetError: There is no data set, or its manifest cannot be read.
     """
-    path = Path(path)
+    path = as_place(path, DatasetError)
     if not repair:
+        path.exists()  # which is refused where a store does not answer
         return _examine(path, repair=False)
+    if isinstance(path, Url):
+        raise DatasetError(
+            f"{path} cannot be repaired, since a store has no locks: repeat `foretrace simulate`"
+        )
     storage.read_manifest(path)  # before the lock, which would leave its file in any folder
     with sole_writer(path, DatasetError):
         return _examine(path, repair=True)
 
 
-def _examine(path: Path, repair: bool) -> Diagnosis:
+def _examine(path: Path | Url, repair: bool) -> Diagnosis:
     findings = list(_stray_files(path, repair))
     try:
         manifest = storage.read_manifest(path)
@@ -70,7 +77,8 @@ def _examine(path: Path, repair: bool) -> Diagnosis:
         findings.append(Finding(storage.MANIFEST, str(error)))
         manifest = None
     tables: dict[str, pa.Table] = {}
-    on_disk = {f.relative_to(path).as_posix() for f in path.glob(f"{storage.SHARD_FOLDER}/shard-*.parquet")}
+    there = fnmatch.filter(names_in(path / storage.SHARD_FOLDER), "shard-*.parquet")
+    on_disk = {f"{storage.SHARD_FOLDER}/{name}" for name in there}
     shards = {} if manifest is None else manifest["shards"]
     for name in sorted(on_disk | set(shards)):
         entry = shards.get(name, {})
@@ -104,14 +112,16 @@ def _examine(path: Path, repair: bool) -> Diagnosis:
     return Diagnosis(tuple(findings), len(outcomes), count_outcomes(outcomes))
 
 
-def _stray_files(path: Path, repair: bool) -> Iterator[Finding]:
+def _stray_files(path: Path | Url, repair: bool) -> Iterator[Finding]:
+    if isinstance(path, Url):  # which has none
+        return
     for folder in (path, path / storage.SHARD_FOLDER, path / recorded.NOTES_FOLDER):
         for file in remove_partial(folder) if repair else partial_files(folder):
             yield Finding(str(file.relative_to(path)), "temporary file of an interrupted run", repair)
 
 
-def _set_aside(path: Path, name: str, shards: dict, problem: str, repair: bool) -> Finding:
-    if repair:
+def _set_aside(path: Path | Url, name: str, shards: dict, problem: str, repair: bool) -> Finding:
+    if repair and isinstance(path, Path):
         shards.pop(name, None)
         done = "removed from the manifest"
         if (path / name).exists():
@@ -159,7 +169,7 @@ def _without_gaps(ids: Iterable[int], start: int, stop: int) -> bool:
     return len(found) == stop - start > 0 and found[0] == start and found[-1] == stop - 1
 
 
-def _unsound_notes(path: Path, tables: dict[str, pa.Table]) -> Iterator[Finding]:
+def _unsound_notes(path: Path | Url, tables: dict[str, pa.Table]) -> Iterator[Finding]:
     """Notes beside recordings that are missing or damaged."""
     for table in tables.values():
         for id in table["id"].drop_null().to_pylist():

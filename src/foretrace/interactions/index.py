@@ -1,4 +1,7 @@
-"""The columns of a large data set that are always at hand, kept in a file beside it, which is not read but mapped."""
+"""The columns of a large data set that are always at hand, kept in a file beside it, which is not read but mapped.
+
+Of a data set at a URL, the file is in the user's cache.
+"""
 
 import json
 from collections.abc import Callable, Sequence
@@ -10,8 +13,9 @@ import pyarrow as pa
 from jaxtyping import Int
 
 from foretrace.errors import DatasetError
-from foretrace.files import atomic_path
+from foretrace.files import atomic_path, cache_folder, make_folder, short_hash
 from foretrace.interactions import storage
+from foretrace.urls import Url, names_in, read_each
 
 INDEX = "index.arrow"
 """File of the columns; it is made again wherever it is missing or does not fit."""
@@ -22,12 +26,12 @@ Entries = Sequence[tuple[str, storage.ShardEntry]]
 
 
 def kept_index(
-    folder: Path, entries: Entries, read: Callable[[int], pa.Table], columns: Sequence[str]
+    folder: Path | Url, entries: Entries, read: Callable[[int], pa.Table], columns: Sequence[str]
 ) -> tuple[pa.Table, list[int]]:
     """Some columns of all shards, and the number of rows of each; only shards that are not in the file are read.
 
     Args:
-        folder: The data set's folder.
+        folder: The data set's folder, or its URL.
         entries: Name and entry of each shard.
         read: The columns of a shard by its place among them.
         columns: Names of the columns.
@@ -35,30 +39,40 @@ def kept_index(
     Raises:
         DatasetError: A shard is missing, or cannot be read.
     """
-    there = {
-        f"{storage.SHARD_FOLDER}/{file.name}" for file in (folder / storage.SHARD_FOLDER).glob("*.parquet")
-    }
+    there = {f"{storage.SHARD_FOLDER}/{name}" for name in names_in(folder / storage.SHARD_FOLDER)}
     if absent := next((name for name, _ in entries if name not in there), None):
         raise DatasetError(f"shard {folder / absent} is missing: {storage.how_to_restore(folder)}")
-    kept, covered = _read(folder, columns)
+    home = _home(folder)
+    kept, covered = _read(home, columns)
     if kept is not None and list(covered) == [(name, entry.get("sha256")) for name, entry in entries]:
         return kept, list(covered.values())
     starts = dict(zip(covered, np.cumsum([0, *covered.values()]).tolist(), strict=False))
-    tables, rows = [], {}
-    for number, (name, entry) in enumerate(entries):
-        key = name, entry.get("sha256")
+
+    def table_of(number: int) -> pa.Table:
+        key = entries[number][0], entries[number][1].get("sha256")
         if kept is not None and key in covered and key[1] is not None:
-            table = kept.slice(starts[key], covered[key])
-        else:
-            table = read(number)
-        tables.append(table)
-        rows[key] = table.num_rows
+            return kept.slice(starts[key], covered[key])
+        return read(number)
+
+    tables = read_each(table_of, range(len(entries)), folder)
+    keys = ((name, entry.get("sha256")) for name, entry in entries)
+    rows = {key: table.num_rows for key, table in zip(keys, tables, strict=True)}
     index = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
     about = json.dumps([[*key, count] for key, count in rows.items()]).encode()
     with suppress(OSError):  # a folder that cannot be written to is read each time
-        _write(folder, index.replace_schema_metadata({SHARDS: about}))
-        return _read(folder, columns)[0] or index, list(rows.values())
+        _write(home, index.replace_schema_metadata({SHARDS: about}))
+        return _read(home, columns)[0] or index, list(rows.values())
     return index, list(rows.values())
+
+
+def _home(folder: Path | Url) -> Path:
+    """Folder of the file: that of the data set, or one of the user's cache."""
+    if isinstance(folder, Path):
+        return folder
+    home = cache_folder("index") / short_hash([str(folder).encode()])
+    with suppress(DatasetError):
+        make_folder(home, DatasetError)
+    return home
 
 
 def _write(folder: Path, index: pa.Table) -> None:

@@ -20,6 +20,7 @@ from foretrace.files import (
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
 from foretrace.schema import Finite, Transform
+from foretrace.urls import Url
 
 CONFIGURATION = {"source": "recorded"}
 OBJECTS = "objects"
@@ -49,7 +50,7 @@ class Notes(TypedDict):
     """Time stamp of each frame [s]."""
 
 
-def read_notes(folder: Path, id: int) -> Notes:
+def read_notes(folder: Path | Url, id: int) -> Notes:
     """What is kept beside a recorded interaction.
 
     Raises:

@@ -25,6 +25,7 @@ from foretrace.interactions.record import Effect, ExecutionOffset, Interaction, 
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, object_from_json
 from foretrace.schema import MOST, Count, Finite, Vector2, parse_json
+from foretrace.urls import Url, is_url
 
 FORMAT = "foretrace-interactions"
 FORMAT_VERSION = 2
@@ -256,7 +257,7 @@ def shard_name(index: int) -> str:
     return f"{SHARD_FOLDER}/shard-{index:05d}.parquet"
 
 
-def write_shard(folder: Path, name: str, table: pa.Table) -> dict[str, Any]:
+def write_shard(folder: Path | Url, name: str, table: pa.Table) -> dict[str, Any]:
     """Write one shard; returns its entry for the manifest (checksum and number of rows)."""
     content = shard_content(table)
     write_bytes(folder / name, content)
@@ -276,7 +277,7 @@ def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
 
 
 def read_shard(
-    folder: Path,
+    folder: Path | Url,
     name: str,
     sha256: str | None = None,
     schema: pa.Schema | None = SCHEMA,
@@ -285,7 +286,7 @@ def read_shard(
     """A shard as a table, and its bytes.
 
     Args:
-        folder: The data set's folder.
+        folder: The data set's folder, or its URL.
         name: The shard's name in the manifest.
         sha256: The checksum that it must have, or None to accept any.
         schema: The schema that it must have, or None to accept any.
@@ -344,16 +345,16 @@ def new_manifest(
     }
 
 
-def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+def write_manifest(folder: Path | Url, manifest: Mapping[str, Any]) -> None:
     """Replace the manifest, atomically; shards in the order of their names, whichever was finished first."""
     write_json(folder / MANIFEST, {**manifest, "shards": dict(sorted(manifest["shards"].items()))})
 
 
-def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
+def read_manifest(folder: Path | Url, older: tuple[int, ...] = ()) -> dict[str, Any]:
     """The manifest of a data set.
 
     Args:
-        folder: The data set's folder.
+        folder: The data set's folder, or its URL.
         older: Older format versions that are accepted as well.
 
     Raises:
@@ -365,7 +366,9 @@ def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
     if not folder.is_dir() and not free:
         raise DatasetError(f"{folder} is a file: give the folder of a data set, or {remedy}")
     if free:
-        raise DatasetError(f"no data set at {folder}: no such folder; {remedy}")
+        raise DatasetError(
+            f"no data set at {folder}: no such folder{' or bucket' * is_url(folder)}; {remedy}"
+        )
     if not path.is_file():
         raise DatasetError(
             f"{folder} is not a data set: it has no {MANIFEST}; give the folder of one, or {remedy}"
@@ -385,12 +388,13 @@ def read_manifest(folder: Path, older: tuple[int, ...] = ()) -> dict[str, Any]:
     return dict(manifest)
 
 
-def how_to_restore(folder: Path, damaged: bool = False) -> str:
+def how_to_restore(folder: Path | Url, damaged: bool = False) -> str:
     """What to do about a shard that is lost, or there and damaged."""
     with suppress(DatasetError):
         if made := read_manifest(folder)["configuration"].get("made"):
             return f"{COMMANDS.get(str(made.get('how')), 'make')} again into a new folder, or restore a copy"
-    first = f"set it aside with `foretrace data {folder} --repair`, then " if damaged else ""
+    aside = damaged and not is_url(folder)
+    first = f"set it aside with `foretrace data {folder} --repair`, then " if aside else ""
     return f"{first}repeat the same `foretrace simulate` command"
 
 

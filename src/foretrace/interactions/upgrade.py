@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.errors import ActionError, DatasetError, shown
-from foretrace.files import remove_partial, sole_writer
+from foretrace.files import as_path, remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.record import ExecutionOffset, Physics, Provenance
 
@@ -55,7 +55,7 @@ def upgrade(path: str | Path) -> int:
     Raises:
         DatasetError: There is no data set, or a shard is damaged.
     """
-    path = Path(path)
+    path = as_path(path, DatasetError)
     storage.read_manifest(path, older=(1,))  # before the lock, which would leave its file in any folder
     with sole_writer(path, DatasetError):
         manifest = storage.read_manifest(path, older=(1,))

@@ -1,16 +1,14 @@
 """Convex pieces of a solid, cut by planes until the volume of their hulls is the solid's own."""
 
 import heapq
-import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from foretrace.errors import ShapeError
-from foretrace.files import atomic_path, make_folder, short_hash, versions_of
+from foretrace.files import atomic_path, cache_folder, make_folder, short_hash, versions_of
 
 GOAL = 0.002
 """Cutting ends where the hulls are larger than the solid by this share of its volume."""
@@ -58,7 +56,7 @@ def cached_pieces(vertices: Points, faces: Faces) -> list[Points]:
     """
     versions = versions_of("manifold3d")
     key = short_hash([VERSION, str(versions).encode(), vertices.tobytes(), faces.tobytes()])
-    file = cache_folder() / f"{key}.npz"
+    file = cache_folder("pieces") / f"{key}.npz"
     try:
         with np.load(file, allow_pickle=False) as content:
             points, ends = content["points"].astype(float), content["ends"].astype(int)
@@ -80,12 +78,6 @@ def cached_pieces(vertices: Points, faces: Faces) -> list[Points]:
     except (OSError, ShapeError):
         pass  # no room or no right to write: the next one cuts again
     return pieces
-
-
-def cache_folder() -> Path:
-    """Where pieces are kept between runs; it may be deleted at any time."""
-    home = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(home) if os.path.isabs(home) else Path.home() / ".cache") / "foretrace" / "pieces"
 
 
 def decompose(solid: Any) -> list[Points]:

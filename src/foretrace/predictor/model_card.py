@@ -21,6 +21,7 @@ from foretrace.predictor.recalibration import SHOWN_LEVELS
 from foretrace.predictor.run_folder import ENVIRONMENT
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
+from foretrace.urls import Url
 
 
 class Environment(TypedDict):
@@ -46,7 +47,7 @@ LIMITS = """\
 - A view that shows several objects, none, or no contact at the object's rim is refused."""
 
 
-def model_card(run: Path, data: Path) -> str:
+def model_card(run: Path, data: Path | Url) -> str:
     """The card of a training.
 
     Args:
@@ -89,7 +90,7 @@ def _about(predictor: EffectPredictor) -> str:
 
 
 def _data(
-    dataset: Dataset, data: Path, parts: Mapping[str, InteractionBatch], families: Mapping[int, str]
+    dataset: Dataset, data: Path | Url, parts: Mapping[str, InteractionBatch], families: Mapping[int, str]
 ) -> str:
     chosen = ", ".join(_settings(dataset.manifest["configuration"]))
     rows = []
@@ -102,7 +103,7 @@ def _data(
     return f"`{data.name}`, simulated with: {chosen}.\n\n" + _table(["Outcome", "Objects", *PARTS], rows)
 
 
-def _training(run: Path, data: Path) -> str:
+def _training(run: Path, data: Path | Url) -> str:
     content, predictor = read_config(run), load_predictor(run)
     training = content.get("training", {})
     if "data" not in training:
@@ -130,7 +131,7 @@ def _training(run: Path, data: Path) -> str:
     )
 
 
-def recalibration_section(run: Path, data: Path, held: Mapping[str, Sequence[float]]) -> str:
+def recalibration_section(run: Path, data: Path | Url, held: Mapping[str, Sequence[float]]) -> str:
     """The section about a `recalibrate` that followed the training.
 
     Args:

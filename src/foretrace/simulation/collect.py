@@ -10,6 +10,7 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,7 +24,6 @@ from foretrace.actions import Action, LeverUp, Screwdriver, ToolPath
 from foretrace.errors import DatasetError, ForetraceError, SimulationError, check_type, is_whole, shown
 from foretrace.files import (
     as_json,
-    as_path,
     first_difference,
     first_stranger,
     make_folder,
@@ -40,6 +40,7 @@ from foretrace.simulation.engine import ENGINES
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import NOTHING, Randomisation
 from foretrace.simulation.recipes import RECIPES
+from foretrace.urls import Url, as_place, names_in
 from foretrace.workers import ProgressReport, count_workers, run_jobs, uses_cluster
 
 MOST = 1_000_000
@@ -160,7 +161,7 @@ _object_and_actions = lru_cache(maxsize=64)(recipes.object_and_actions)
 
 def collect(
     config: CollectConfig,
-    out: str | Path,
+    out: str | Path | Url,
     workers: int | None = None,
     console: Console | None = None,
     simulate: Callable[[CollectConfig, int], Interaction] = simulate_trial,
@@ -169,7 +170,7 @@ def collect(
 
     Args:
         config: What to simulate.
-        out: The data set's folder.
+        out: The data set's folder, or its URL.
         workers: Processes, by default one for each core. Their number does not change the data.
         console: Where progress is reported; standard error by default.
         simulate: Makes one interaction from a configuration and an id.
@@ -182,10 +183,11 @@ def collect(
         SimulationError: A trial could not be simulated at all.
     """
     check_type("config", config, CollectConfig, SimulationError)
-    out, console = as_path(out, DatasetError), console or Console(stderr=True)
+    out, console = as_place(out, DatasetError), console or Console(stderr=True)
     workers = count_workers(workers, SimulationError)
     _prepare_folder(out)
-    with sole_writer(out, DatasetError):
+    # A store has no locks: two commands there do the same work twice, with the same bytes.
+    with nullcontext() if isinstance(out, Url) else sole_writer(out, DatasetError):
         manifest = _open_manifest(config, out, console)
         counts, todo = _take_stock(out, manifest, console)
         with ProgressReport("interactions", manifest["num_trials"], counts.total(), console) as report:
@@ -203,15 +205,16 @@ def collect(
     return count_outcomes(list(counts.elements()))
 
 
-def _prepare_folder(out: Path) -> None:
+def _prepare_folder(out: Path | Url) -> None:
     if out.exists() and not out.is_dir():
         raise DatasetError(f"{out} is a file; choose a folder for the data set")
     if not (out / storage.MANIFEST).exists() and (stranger := first_stranger(out, (storage.SHARD_FOLDER,))):
         raise DatasetError(f"{out} holds {stranger} and is no data set; choose a new folder")
-    make_folder(out / storage.SHARD_FOLDER, DatasetError)
+    if isinstance(out, Path):
+        make_folder(out / storage.SHARD_FOLDER, DatasetError)
 
 
-def _open_manifest(config: CollectConfig, out: Path, console: Console) -> dict[str, Any]:
+def _open_manifest(config: CollectConfig, out: Path | Url, console: Console) -> dict[str, Any]:
     """The manifest in the folder, checked against the configuration; a new one in an empty folder."""
     wanted = as_json(asdict(config))
     if not (out / storage.MANIFEST).exists():
@@ -244,21 +247,23 @@ def _current_versions(config: CollectConfig) -> dict[str, str]:
 
 
 def _take_stock(
-    out: Path, manifest: dict[str, Any], console: Console
+    out: Path | Url, manifest: dict[str, Any], console: Console
 ) -> tuple[Counter[str], dict[str, range]]:
     """Outcomes of the shards that are done, and the ids of those that are not.
 
     A shard without a checksum (the crash came before the manifest's update) is kept if it is whole.
     """
-    for folder in (out, out / storage.SHARD_FOLDER):
-        remove_partial(folder, everywhere=uses_cluster())
+    if isinstance(out, Path):
+        for folder in (out, out / storage.SHARD_FOLDER):
+            remove_partial(folder, everywhere=uses_cluster())
+    there = set(names_in(out / storage.SHARD_FOLDER))
     counts: Counter[str] = Counter()
     todo: dict[str, range] = {}
     total, size = manifest["num_trials"], manifest["shard_size"]
     for index, start in enumerate(range(0, total, size)):
         name, ids = storage.shard_name(index), range(start, min(start + size, total))
         entry = manifest["shards"].pop(name, None)
-        if entry is None and not (out / name).exists():
+        if entry is None and name.rpartition("/")[2] not in there:
             todo[name] = ids
             continue
         try:
@@ -277,7 +282,7 @@ def _take_stock(
 
 def _simulate_shards(
     config: CollectConfig,
-    out: Path,
+    out: Path | Url,
     todo: dict[str, range],
     workers: int,
     simulate: Callable[[CollectConfig, int], Interaction],
@@ -303,7 +308,7 @@ def _simulate_shards(
 
 def _simulate_on_cluster(
     config: CollectConfig,
-    out: Path,
+    out: Path | Url,
     todo: dict[str, range],
     workers: int,
     simulate: Callable[[CollectConfig, int], Interaction],
@@ -315,7 +320,8 @@ def _simulate_on_cluster(
     for name, entry, found in run_jobs(function, list(todo.items()), workers, error=SimulationError):
         _count(found, counts, report)
         yield name, entry
-    remove_partial(out / storage.SHARD_FOLDER, everywhere=True)  # of processes that were killed
+    if isinstance(out, Path):
+        remove_partial(out / storage.SHARD_FOLDER, everywhere=True)  # of processes that were killed
 
 
 def _count(found: Counter[str], counts: Counter[str], report: ProgressReport) -> None:
@@ -367,13 +373,17 @@ def _simulate_one(
 def _simulate_shard(
     simulate: Callable[[CollectConfig, int], Interaction],
     config: CollectConfig,
-    out: Path,
+    out: Path | Url,
     shard: tuple[str, range],
 ) -> tuple[str, dict[str, Any], Counter[str]]:
     """All trials of a shard, into its file; its name and entry, and how often each outcome occurs."""
-    if not (out / storage.MANIFEST).is_file():
+    try:
+        seen = (out / storage.MANIFEST).is_file()
+    except DatasetError as error:
+        raise SimulationError(f"node {platform.node()}: {error}") from error
+    if not seen:
         raise SimulationError(
-            f"node {platform.node()} does not see {out / storage.MANIFEST}: give a folder that all nodes share"
+            f"node {platform.node()} does not see {out / storage.MANIFEST}: give a folder that all share, or a URL"
         )
     ((name, table),) = _simulate_chunks(simulate, config, [shard])
     return name, storage.write_shard(out, name, table), Counter(table["outcome"].to_pylist())
