@@ -50,10 +50,10 @@ class Visitor:
     def label(self, uuid: str) -> str:
         return self.controls[uuid]["label"]
 
-    def find(self, label: str) -> str:
-        """A control by the beginning of its label."""
+    def find(self, label: str, kind: str = "") -> str:
+        """A control by the beginning of its label; of that kind, if one is given."""
         for uuid, props in self.controls.items():
-            if str(props.get("label", "")).startswith(label):
+            if str(props.get("label", "")).startswith(label) and kind in ("", props["type"]):
                 return uuid
         raise KeyError(f"{label}: {[each.get('label') for each in self.controls.values()]}")
 
@@ -62,6 +62,15 @@ class Visitor:
 
     def click(self, label: str) -> None:
         self.set(label, True)
+
+    def upload(self, label: str, name: str, content: bytes, size: int | None = None, parts: int = 1) -> None:
+        """Send the first part of a file; a size may be claimed that it does not have."""
+        here = {"source_component_uuid": self.find(label), "transfer_uuid": f"{name}-{len(content)}"}
+        size = len(content) if size is None else size
+        self._send(
+            "FileTransferStartUpload", **here, filename=name, mime_type="", part_count=parts, size_bytes=size
+        )
+        self._send("FileTransferPart", **here, part_index=0, content=content)
 
     def value(self, label: str) -> Any:
         return self.controls[self.find(label)]["value"]
@@ -131,6 +140,8 @@ class Visitor:
             self.nodes[message["name"]] = {"type": kind, **message["props"]}
             self.drawn += message["name"] == "/path0"  # comes after the tube, and all that is expected
             self.owner = message.get("owner") or self.owner
+        elif kind == "SetSceneNodeVisibilityMessage" and message["name"] in self.nodes:
+            self.nodes[message["name"]]["visible"] = message["visible"]
         elif kind in ("SetPositionMessage", "SetOrientationMessage") and message["name"] in self.nodes:
             self.nodes[message["name"]].update(
                 {k: v for k, v in message.items() if k in ("position", "wxyz")}

@@ -51,6 +51,20 @@ def test_examples_are_short_and_say_what_they_do(example: Path) -> None:
     assert text.startswith('"""')
 
 
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notebook = json.loads((EXAMPLES / "getting_started.ipynb").read_text(encoding="utf-8"))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    for cell in code:
+        exec(compile("".join(cell["source"]), cell["id"], "exec"), found)
+    assert found["effect"].outcome == "levered"
+    assert found["error"] < 0.01
+    assert found["verdict"].cause == "tracker frozen"
+    assert Image.open(tmp_path / "imagined.png").width > 600
+
+
 def test_own_experiment(tmp_path: Path) -> None:
     printed = run_python(EXAMPLES / "own_experiment.py", tmp_path / "out")
     assert len(re.findall(r"^\| (0.3|0.8|1.2) \| \d+\.\d\d \|$", printed, re.MULTILINE)) == 3

@@ -16,10 +16,10 @@ from PIL import Image
 
 import foretrace as ft
 from foretrace import cli
-from foretrace.cli.example import CONTACT, HEIGHT, MASK, SCALE
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined.futures import carried_poses
 from foretrace.imagined.observed import rotations_since_rest
+from foretrace.perception.example import CONTACT, HEIGHT, MASK, SCALE
 from foretrace.pictures import animation
 from foretrace.pictures.prediction import scene_of
 from foretrace.predictor import load_imaginer

@@ -3,6 +3,7 @@
 import io
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +14,18 @@ import foretrace as ft
 from foretrace import cli
 from foretrace.errors import ForetraceError
 from foretrace.geometry import transform_points
+from foretrace.perception.example import HEIGHT, example_file
+from foretrace.perception.photo import PhotoConfig, open_photo
 from foretrace.predictor import load_imaginer
+from foretrace.simulation.arm_parts import arm_poses
 from foretrace.studio import saving
+from foretrace.studio.arm import PERIOD, postures
 from foretrace.studio.choices import Choices, link_of
-from foretrace.studio.controls import learned_html, verdict_html
+from foretrace.studio.photographs import PhotoRequest, example_request, picture_of
 from foretrace.studio.scenery import edges_of, futures_of, observed_motion, rim_segments, shown_times, tube
 from foretrace.studio.session import LEVEL, Session
 from foretrace.studio.shapes import EXAMPLES, example, from_file, from_text, prism_of
+from foretrace.studio.texts import learned_html, verdict_html
 from foretrace.studio.watching import WISHES
 
 TRIANGLE = "0 0\n0.12 0\n0.05 0.1\n"
@@ -31,6 +37,7 @@ def png(mask: np.ndarray) -> bytes:
     return written.getvalue()
 
 
+PHOTO = ("photo.jpg", example_file("photo.jpg"))
 SQUARE = png(np.pad(np.full((100, 120), 255, np.uint8), 30))
 
 REFUSED = {
@@ -67,6 +74,27 @@ REFUSED = {
     "a cylinder cannot have an other shape": lambda: Session(
         Choices(object=ft.Cylinder(0.03, 0.1), along=0.3)
     ).watch("other shape"),
+    "there is no photograph yet": lambda: PhotoRequest({}, 0.02).observe(),
+    "background needs a photograph of the table": lambda: PhotoRequest({"photo": PHOTO}, 0.02).observe(),
+    "grabcut needs a box": lambda: PhotoRequest({"photo": PHOTO}, 0.02, "grabcut").observe(),
+    "colour needs the contact": lambda: PhotoRequest({"photo": PHOTO}, 0.02, "colour").observe(),
+    "the box is '1 2 3'": lambda: PhotoRequest({"photo": PHOTO}, 0.02, box="1 2 3").observe(),
+    "the contact is 'here'": lambda: PhotoRequest({"photo": PHOTO}, 0.02, contact="here").observe(),
+    "height is -0.02": lambda: PhotoRequest({"photo": PHOTO}, -0.02, "threshold").observe(),
+    "photo.png has 5000 x 4000 pixels": lambda: PhotoRequest(
+        {"photo": ("photo.png", png(np.zeros((4000, 5000), bool)))}, 0.02, "threshold"
+    ).observe(),
+    "photo.jpg has 9.0 MB": lambda: PhotoRequest(
+        {"photo": ("photo.jpg", bytes(9 << 20))}, 0.02, "threshold"
+    ).observe(),
+    "cannot read an image from photo.jpg": lambda: PhotoRequest(
+        {"photo": ("../photo.jpg", b"no picture")}, 0.02, "threshold"
+    ).observe(),
+    "the photograph has": lambda: PhotoRequest({"photo": ("photo.png", SQUARE)}, 0.02, "threshold").observe(),
+    "camera.yaml": lambda: PhotoRequest(
+        {"photo": PHOTO, "camera": ("camera.yaml", b"[1, 2")}, 0.02, "threshold"
+    ).observe(),
+    "the point (x, y) [m]": lambda: Session().turn_from(np.array([0.0, np.inf])),
     "the contact (x, y) [m]": lambda: Session().move_to(np.array([np.nan, 0.0])),
 }
 
@@ -95,6 +123,36 @@ def test_objects_come_from_text_masks_and_meshes():
     box = trimesh.creation.box((80, 60, 20)).export(file_type="stl")
     assert isinstance(from_file("part.STL", box, scale=0.001), ft.MeshObject)
     assert from_file("t.csv", TRIANGLE.replace(" ", ",").encode(), height=0.03).height == 0.03
+
+
+def test_a_photograph_shows_what_it_shows_to_the_command():
+    seen = example_request().observe()
+    folder = Path(ft.__file__).parent / "assets/example"
+    commanded = open_photo(
+        folder / "photo.jpg", (565.0, 209.0), background=folder / "background.jpg",
+        config=PhotoConfig(mask="background", height=HEIGHT),
+    )  # fmt: skip
+    np.testing.assert_array_equal(seen.placed.object.corners, commanded.placed.object.corners)
+    np.testing.assert_array_equal(seen.action.contact, commanded.action.contact)
+    session = Session(Choices(object=seen.placed.object))
+    session.take(seen.action)
+    assert np.linalg.norm(session.action.contact - seen.action.contact) < 1e-9
+    small = picture_of(seen, session.action, session.imagined).astype(int)
+    assert small.shape == (270, 480, 3)
+    assert (np.abs(small - picture_of(seen, session.action, None)).max(axis=2) > 60).mean() > 0.002
+
+
+def test_the_arm_is_where_the_simulated_arm_is():
+    path = Choices(speed=1.2).path
+    action = ft.LeverUp.at_edge(EXAMPLES["bracket"], 1, path=path)
+    simulated = ft.simulate(EXAMPLES["bracket"], action).effect
+    moved = arm_poses(action.tool, simulated.joint_trajectory)
+    times = np.rint(simulated.times / PERIOD).astype(int)
+    shown = postures(path)[:, times[times < postures(path).shape[1]]]
+    apart = np.linalg.norm((moved[:, : shown.shape[1]] - shown)[..., :3], axis=-1)
+    assert len(shown) == 10
+    assert apart.max() < 0.004
+    assert np.ptp(shown[-1, :, 2]) > 0.05  # the holder lifts
 
 
 def test_a_link_holds_all_choices():
@@ -347,6 +405,55 @@ def test_a_visitor_draws_an_outline_and_mistakes_are_told(served):
         visitor.set("x y [m]", "0 0\nx")
         visitor.click("use these corners")
         visitor.look(lambda: "corners.txt, line 2" in visitor.html)
+
+
+def test_a_visitor_gives_a_photograph(served):
+    with visit(served) as visitor:
+        visitor.click("example photograph")
+        visitor.look(lambda: visitor.value("example") == "your own")
+        visitor.look(lambda: visitor.controls[visitor.find("photograph", "GuiImageMessage")]["visible"])
+        assert visitor.value("height") == 18
+        assert visitor.value("contact [px]") == "565 209"
+        visitor.set("object told by", "grabcut")
+        visitor.click("find the object")
+        visitor.look(lambda: "grabcut needs a box" in visitor.html)
+        visitor.upload("choose a camera", "other.json", b"{}")
+        visitor.look(lambda: "camera: other.json" in visitor.texts())
+        visitor.set("object told by", "threshold")
+        visitor.click("find the object")
+        visitor.look(lambda: "other.json" in visitor.html)
+        visitor.set("example", "book")
+        visitor.look(lambda: not visitor.controls[visitor.find("photograph", "GuiImageMessage")]["visible"])
+
+
+def test_large_files_are_dropped_while_they_arrive(served):
+    with visit(served) as visitor:
+        visitor.upload("choose a photograph", "large.jpg", b"", size=9 << 20)
+        visitor.look(lambda: "large.jpg has 9.0 MB: give at most 8 MB" in visitor.html)
+        visitor.upload("choose a photograph", "liar.jpg", bytes(9 << 20), size=10, parts=2)
+        visitor.look(lambda: "liar.jpg has 9.0 MB" in visitor.html)
+        page = list(served.pages.values())[-1]
+        assert not page._client.gui._current_file_upload_states
+        for k in range(5):
+            visitor.upload("choose a photograph", f"half{k}.jpg", b"1", size=2, parts=2)
+        visitor.look(lambda: "4 files are on their way already: send half4.jpg" in visitor.html)
+        page._client.gui._current_file_upload_states.clear()
+        visitor.upload("choose a photograph", "small.jpg", b"1")
+        visitor.look(lambda: "photo: small.jpg" in visitor.texts())
+
+
+def test_a_visitor_sees_the_arm(served):
+    with visit(served) as visitor:
+        assert "/arm/part0" not in visitor.nodes
+        visitor.set("arm", True)
+        visitor.look(lambda: "position" in visitor.nodes.get("/arm/part9", {}))
+        before = visitor.nodes["/arm/part9"]["position"], visitor.nodes["/arm"]["position"]
+        visitor.set("time [s]", 2.0)
+        visitor.look(lambda: visitor.nodes["/arm/part9"]["position"] != before[0])
+        visitor.drag(-0.05, -0.2)
+        visitor.look(lambda: visitor.nodes["/arm"]["position"] != before[1])
+        visitor.set("arm", False)
+        visitor.look(lambda: visitor.nodes["/arm"]["visible"] is False)
 
 
 def test_a_visitor_plans_and_simulates(served):

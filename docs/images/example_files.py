@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 
 from foretrace.actions import LeverUp
-from foretrace.cli.example import BACKGROUND, CONTACT, FILES, HEIGHT, MASK, PHOTO, SCALE
 from foretrace.errors import PredictionError
 from foretrace.geometry import invert_transform
 from foretrace.images import read_image
 from foretrace.objects import Prism
 from foretrace.objects.shape_files import read_silhouette_image
+from foretrace.perception.example import BACKGROUND, CONTACT, FILES, HEIGHT, MASK, PHOTO, SCALE
 from foretrace.simulation.lens import WEBCAM
 from foretrace.simulation.recording import RecordingConfig, record_lever_up
 

@@ -1,6 +1,6 @@
 """Picture of the page Studio: the page in headless Chromium. Needs `pip install playwright` and Chromium.
 
-python docs/images/studio.py [--chromium /usr/bin/chromium] [--width 1280] [--dark]
+python docs/images/studio.py [--chromium /usr/bin/chromium] [--width 1280] [--dark] [--arm] [--photo] [--out PICTURE]
 """
 
 import argparse
@@ -22,6 +22,8 @@ SOFTWARE = (
 """Draws in three dimensions without a graphics card."""
 EYE = (0.24, -0.22, 0.17)
 """Where the camera is, in the object's frame [m]."""
+EYE_OF_ARM = (0.62, 0.3, 0.26)
+"""Where it is to show the whole arm."""
 SECONDS = 2.0
 """The moment that is shown [s]."""
 
@@ -33,6 +35,8 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=1280)
     parser.add_argument("--height", type=int, default=760)
     parser.add_argument("--dark", action="store_true")
+    parser.add_argument("--arm", action="store_true", help="with the arm")
+    parser.add_argument("--photo", action="store_true", help="the object of the example photograph")
     parser.add_argument("--at", default=FIRST)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".png"))
     options = parser.parse_args()
@@ -44,11 +48,19 @@ def main() -> None:
         page.get_by_text("levered", exact=True).first.wait_for(timeout=120_000)
         visitor = next(iter(server.pages.values()))
         visitor.controls.play.value = False
-        visitor.show_from(EYE)
+        if options.photo:
+            visitor.act(visitor._take_example_photo)
+        visitor.controls.arm.value = options.arm
+        visitor.act(lambda: None)
+        visitor.show_from(EYE_OF_ARM if options.arm else EYE)
         visitor.controls.time.value = SECONDS
         visitor.stage.show_time(SECONDS)
         page.locator(".mantine-Notification-closeButton").first.click(timeout=120_000)
         page.wait_for_timeout(15_000)
+        if options.photo:
+            page.get_by_role("tab", name="Object").click()
+            page.get_by_text("Photograph", exact=True).click(timeout=120_000)
+            page.wait_for_timeout(5_000)
         page.screenshot(path=options.out, timeout=120_000)
         browser.close()
     server.stop()

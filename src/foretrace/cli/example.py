@@ -1,25 +1,22 @@
-"""The example that comes with foretrace: an object's mask, and a photograph of it on a table."""
+"""The example that comes with foretrace, as files in a folder, and the commands that predict it."""
 
-from importlib.resources import files
 from pathlib import Path
 
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.objects import ObjectOptions
 from foretrace.errors import PredictionError
 from foretrace.files import make_folder, write_bytes
-
-EXAMPLE = "example"
-"""Folder of the example's files."""
-MASK, PHOTO, BACKGROUND = "mask.png", "photo.jpg", "background.jpg"
-FILES = (MASK, PHOTO, BACKGROUND, "camera.json", "markers.json")
-SCALE = 0.0005
-"""Metres per pixel of the mask."""
-HEIGHT = 0.018
-"""Height of the object [m]."""
-CONTACT = (-0.0687, -0.0289)
-"""Where it is levered, in the mask's frame [m]."""
-CONTACT_PX = (565, 209)
-"""The same point in the photograph."""
+from foretrace.perception.example import (
+    BACKGROUND,
+    CONTACT,
+    CONTACT_PX,
+    FILES,
+    HEIGHT,
+    MASK,
+    PHOTO,
+    SCALE,
+    example_file,
+)
 
 
 def write_example(folder: Path) -> tuple[ObjectOptions, ContactOptions]:
@@ -30,7 +27,7 @@ def write_example(folder: Path) -> tuple[ObjectOptions, ContactOptions]:
     """
     make_folder(folder, PredictionError)
     for name in FILES:
-        write_bytes(folder / name, files("foretrace").joinpath("assets", EXAMPLE, name).read_bytes())
+        write_bytes(folder / name, example_file(name))
     return ObjectOptions(image=folder / MASK, scale=SCALE, height=HEIGHT), ContactOptions(contact=CONTACT)
 
 

@@ -12,13 +12,14 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from foretrace.actions import ToolPath
 from foretrace.cli.batch import ManyOptions, predict_many
 from foretrace.cli.contact import ContactOptions
-from foretrace.cli.example import EXAMPLE, say_example, write_example
+from foretrace.cli.example import say_example, write_example
 from foretrace.cli.futures import say_futures
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
 from foretrace.imagined.context import CONSTANTS, CONTEXT, EXACT, PARAMETERS, nominal_constants
 from foretrace.imagined.shown import LEVEL, radius_of
+from foretrace.perception.example import EXAMPLE
 from foretrace.perception.photo import PhotoConfig
 
 if TYPE_CHECKING:

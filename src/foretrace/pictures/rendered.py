@@ -16,7 +16,7 @@ from foretrace.imagined.shown import radius_of
 from foretrace.interactions.record import Interaction
 from foretrace.pictures.animation import write_animation
 from foretrace.pictures.style import PREDICTION_COLORS, TRUTH_COLOR
-from foretrace.simulation import arm
+from foretrace.simulation.arm_parts import joints_along
 from foretrace.simulation.camera import make_renderer
 from foretrace.simulation.scene import body_origin, build_scene
 
@@ -72,10 +72,7 @@ def rendered_frames(
     joints = effect.joint_trajectory
     if joints.shape[1] == 0:
         tip = pose_to_matrix(effect.tool_trajectory)
-        model_without = build_scene(
-            None, interaction.physics, interaction.action.tool, "arm", 0.002
-        ).compile()
-        joints = arm.solve_joint_path(model_without, tip, float(np.median(np.diff(effect.times)))).positions
+        joints = joints_along(interaction.action.tool, tip, float(np.median(np.diff(effect.times))))
     with make_renderer(model, HEIGHT, WIDTH) as renderer:
         for k in range(len(effect.times)):
             data.qpos[:7], data.qpos[7:] = poses[k], joints[k]

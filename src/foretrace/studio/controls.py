@@ -1,23 +1,21 @@
 """The panel of a visitor's page, in viser: buttons and sliders, made from the choices and their limits."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from html import escape
 from typing import Any, get_args
 
 import numpy as np
 
-from foretrace.imagined import Belief, ImaginedEffect
-from foretrace.pictures.style import GREY, OUTCOME_COLORS, PREDICTION_COLORS
+from foretrace.imagined import ImaginedEffect
 from foretrace.studio.choices import LIMITS, PHYSICS, Choices, GoalName
+from foretrace.studio.photographs import PhotoPanel
 from foretrace.studio.session import LEVEL
 from foretrace.studio.shapes import EXAMPLES
+from foretrace.studio.texts import result_html, verdict_html
 from foretrace.studio.watching import SURPRISE, WISHES, Watched
 
 OWN = "your own"
 """What the list of examples says of an object that is none of them."""
-LEAST_SHOWN = 5e-4
-"""Outcomes less probable than this are not listed."""
 DEGREE = float(np.pi / 180)
 
 
@@ -165,6 +163,7 @@ class Controls:
                 "imagined by", ("learned", "twin"), initial_value=choices.imaginer
             )
             self.tubes = gui.add_checkbox(f"{LEVEL:.0%} region", True)
+            self.arm = gui.add_checkbox("arm", False, hint="The UR10 that leads the screwdriver.")
             self.twin = gui.add_checkbox(
                 "twin beside it", False, hint="The twin simulates what it sees: purple."
             )
@@ -177,7 +176,12 @@ class Controls:
         self.drawn = gui.add_button("finish the outline", color="green", visible=False)
         self.undraw = gui.add_button("cancel", color="gray", visible=False)
         self.height = gui.add_number(
-            "height [mm]", 20.0, min=1.0, max=200.0, step=1.0, hint="Of what is drawn."
+            "height [mm]",
+            20.0,
+            min=1.0,
+            max=200.0,
+            step=1.0,
+            hint="Of what is drawn, masked or photographed.",
         )
         with gui.add_folder("Corners as text", expand_by_default=False):
             self.corners = gui.add_text("x y [m]", "", multiline=True)
@@ -194,6 +198,7 @@ class Controls:
             self.upload = gui.add_upload_button(
                 "choose a file", hint="PNG, STL, OBJ, PLY, OFF, CSV, TXT, JSON."
             )
+        self.photo = PhotoPanel(gui)
         self.row = gui.add_number("row of the data set", 0, min=0, step=1, visible=data)
         self.use_row = gui.add_button(
             "use this row", visible=data, hint="Its object and lever-up; what was recorded of it is green."
@@ -251,93 +256,3 @@ class Controls:
     def show_result(self, imagined: ImaginedEffect | None, message: str = "") -> None:
         """Outcomes with their probabilities, and a message."""
         self.result.content = result_html(imagined, message)
-
-
-def result_html(imagined: ImaginedEffect | None, message: str = "") -> str:
-    """Outcomes with their probabilities as bars, the region's radius at the end, and a message, in HTML."""
-    rows = []
-    if imagined is not None:
-        chances = sorted(imagined.futures.outcomes().items(), key=lambda item: -item[1][0])
-        for name, chance in chances[:3]:
-            share, colour = float(chance[0]), OUTCOME_COLORS.get(name, GREY)
-            if share < LEAST_SHOWN:
-                continue
-            rows.append(
-                f'<div style="display:flex;align-items:center;gap:0.5em;line-height:1.35">'
-                f'<span style="width:5.2em">{escape(name)}</span>'
-                f'<span style="flex:1;background:rgba(128,128,128,.18);border-radius:3px;height:0.75em">'
-                f'<span style="display:block;width:{100 * share:.1f}%;background:{colour};height:100%;'
-                f'border-radius:3px"></span></span><span style="width:3.2em;text-align:right">{share:.1%}</span></div>'
-            )
-        best = int(imagined.futures.probability[0].argmax())
-        radius = float(imagined.futures.radius(LEVEL)[0, best, -1])
-        told = f"{100 * radius:.1f} cm" if np.isfinite(radius) else "unknown"
-        rows.append(f'<div style="opacity:.7">radius of the {LEVEL:.0%} region at the end: {told}</div>')
-        rows += [_note(warning) for warning in imagined.warnings[:2]]
-    if message:
-        rows.append(_note(message))
-    return f'<div style="padding:0.4em 1em 0.2em;font-size:0.82em">{"".join(rows)}</div>'
-
-
-def learned_html(truth: Mapping[str, float], beliefs: Sequence[Belief]) -> str:
-    """What is believed of each constant before and after lever-ups, and what it is, in HTML."""
-    before = Belief()
-    heads = ["", "before", *(f"after {k}" for k in range(1, len(beliefs) + 1)), "truth"]
-    rows = [
-        [
-            name.replace("_", " "),
-            *(f"{b.mean[name]:.3g} ± {b.std[name]:.2g}" for b in (before, *beliefs)),
-            f"{value:.3g}",
-        ]
-        for name, value in truth.items()
-    ]
-    cells = [
-        "".join(f"<td style='padding:0 0.35em'>{escape(cell)}</td>" for cell in row) for row in (heads, *rows)
-    ]
-    lines = "".join(f"<tr>{each}</tr>" for each in cells)
-    return f'<table style="font-size:0.75em;line-height:1.6;margin:0.4em">{lines}</table>'
-
-
-def _note(text: str) -> str:
-    return f'<div style="color:{PREDICTION_COLORS[0]};line-height:1.25;margin-top:0.3em">{escape(text)}</div>'
-
-
-def verdict_html(watched: Watched, k: int) -> str:
-    """Score, threshold, alarm and cause up to a sample, in HTML; in the end, what went wrong."""
-    verdicts = watched.verdicts[: k + 1]
-    last, end = verdicts[-1], float(watched.times[-1])
-    low, high = np.log(0.05), np.log(max(20.0, 1.2 * max(each.score for each in watched.verdicts)))
-
-    def place(time: float, score: float) -> str:
-        y = (np.log(max(score, 0.05)) - low) / (high - low)
-        return f"{300 * time / end:.1f},{100 - 100 * float(y):.1f}"
-
-    limit = float(place(0.0, last.threshold).split(",")[1])
-    curve = " ".join(place(each.time, each.score) for each in verdicts)
-    alarm = next((each for each in verdicts if each.alarm), None)
-    red = PREDICTION_COLORS[0]
-    mark = (
-        ""
-        if alarm is None
-        else f'<path d="M{300 * alarm.time / end:.1f} 0v100" stroke="{red}" stroke-width="1"/>'
-    )
-    chart = (
-        f'<svg viewBox="0 0 300 100" style="width:100%;height:110px;background:rgba(128,128,128,.12)">'
-        f'<path d="M0 {limit:.1f}h300" stroke="currentColor" stroke-dasharray="5 4" stroke-width="1"/>{mark}'
-        f'<polyline points="{curve}" fill="none" stroke="{red}" stroke-width="2"/></svg>'
-    )
-    rows = [
-        f"<div>score {last.score:.2f}, alarm above {last.threshold:.2f} (dashed; logarithmic)</div>",
-        "<div>" + ", ".join(f"{escape(n)} {p:.0%}" for n, p in last.outcomes.items() if p > 0.01) + "</div>",
-    ]
-    if alarm is None:
-        rows.append(f"<div><b>{escape(last.message)}</b></div>")
-    else:
-        causes = ", ".join(f"{escape(name)} {p:.0%}" for name, p in last.causes.items() if p > 0.05)
-        cause = escape(str(last.cause))
-        rows.append(
-            f'<div style="color:{red}"><b>alarm at {alarm.time:.2f} s: {cause}</b></div><div>{causes}</div>'
-        )
-    if k >= len(watched.times) - 1:
-        rows.append(f"<div>In truth: <b>{escape(watched.truth)}</b></div>")
-    return f'<div style="padding:0.4em 1em;font-size:0.82em;line-height:1.5">{chart}{"".join(rows)}</div>'

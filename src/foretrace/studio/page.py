@@ -13,14 +13,18 @@ from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, StudioError
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
-from foretrace.planning import Plan
-from foretrace.studio.choices import LARGEST_TURN, Choices, link_of
-from foretrace.studio.controls import OWN, Controls, learned_html
+from foretrace.perception.photo import PhotoView
+from foretrace.studio.choices import Choices, link_of
+from foretrace.studio.controls import OWN, Controls
+from foretrace.studio.drawing import Drawing
+from foretrace.studio.photographs import PhotoRequest, picture_of
 from foretrace.studio.saving import animation, picture, plan_file, python_lines
 from foretrace.studio.scenery import Moving, futures_of, observed_motion, shown_times
 from foretrace.studio.session import LEVEL, Session
-from foretrace.studio.shapes import MOST_CORNERS, checked, example, from_file, from_text, prism_of
+from foretrace.studio.shapes import checked, example, from_file, from_text
 from foretrace.studio.stage import LOOK_AT, Stage
+from foretrace.studio.texts import learned_html, plan_text, simulated_text
+from foretrace.studio.uploads import bound_uploads
 
 FRAME = 1 / 25
 """Time between two pictures while time runs [s]."""
@@ -49,12 +53,13 @@ class Page:
         self._client, self._data, self._address = client, data, address
         self._lock, self._numbers, self._latest = RLock(), count(1), 0
         self._closed = Event()
-        self._drawn: list[np.ndarray] | None = None
         self._dragged: tuple[np.ndarray, bool] | None = None
         self._told = -1
         self._message = ""
+        self._photo: PhotoView | None = None
         self.stage = Stage(client)
         self.controls = Controls(client.gui, choices, self._choose, data is not None)
+        self._drawing = Drawing(client.scene, self.controls, self.stage)
         self._connect()
         self.stage.show_object(choices.object)
         self.act(lambda: None, message)
@@ -105,12 +110,12 @@ class Page:
         controls = self.controls
         for name in ("exact", "imaginer", "goal"):
             _on(getattr(controls, name), lambda name=name: self._choose(name))
-        for handle in (controls.tubes, controls.twin, controls.rim):
+        for handle in (controls.tubes, controls.twin, controls.rim, controls.arm):
             _on(handle, lambda: self.act(lambda: None))
         _on(controls.time, lambda: self._show_time(float(controls.time.value)))
         _on(controls.example, lambda: self.act(self._take_example))
-        _on(controls.draw, lambda: self.act(lambda: self._draw_outline(True)))
-        _on(controls.undraw, lambda: self.act(lambda: self._draw_outline(False)))
+        _on(controls.draw, lambda: self.act(self._begin_outline))
+        _on(controls.undraw, lambda: self.act(self._drawing.end))
         _on(controls.drawn, lambda: self.act(self._finish_outline))
         _on(controls.use_corners, lambda: self.act(self._take_corners))
         _on(controls.use_row, lambda: self.act(self._take_row))
@@ -132,6 +137,12 @@ class Page:
         ):
             _on(handle, lambda name=name, make=make: self.act(lambda: self._save(name, make)))
         controls.upload.on_upload(lambda event: self.act(self._take_file))
+        photo = controls.photo
+        for kind, button in photo.uploads.items():
+            button.on_upload(lambda event, kind=kind: self.act(lambda: photo.take(kind)))
+        _on(photo.example, lambda: self.act(self._take_example_photo))
+        _on(photo.find, lambda: self.act(lambda: self._take_photo(photo.request(self._height()))))
+        bound_uploads(self._client.gui, lambda text: self._later(lambda: None, text))
         for handle in (self.stage.grip, *self.stage.parts):
             for modifier in (None, "shift"):
                 handle.on_drag("left", modifier=modifier)(self._drag)
@@ -143,29 +154,27 @@ class Page:
         if abs(way[2]) < 1e-6 or (reach := -eye[2] / way[2]) <= 0:
             return
         self._dragged = (eye + reach * way)[:2], event.modifier == "shift"
-        self._client._viser_server._thread_executor.submit(lambda: self.act(self._follow))
+        self._later(self._follow)
+
+    def _later(self, work: Callable[[], None], message: str = "") -> None:
+        """Do something in another thread than the one that takes in messages."""
+        self._client._viser_server._thread_executor.submit(lambda: self.act(work, message))
 
     def _follow(self) -> None:
         """Bring the contact, or the direction, to where the pointer is."""
         if self._dragged is None:
             return
         point, turns = self._dragged
-        if not turns:
+        if turns:
+            self.session.turn_from(point)
+        else:
             self.session.move_to(point)
-            return
-        action, chosen = self.session.action, self.session.choices
-        way = action.contact - point
-        if np.linalg.norm(way) > 1e-3:
-            old = np.arctan2(action.direction[1], action.direction[0])
-            change = np.arctan2(way[1], way[0]) - old
-            turn = chosen.turn + (change + np.pi) % (2 * np.pi) - np.pi
-            self.session.change(turn=float(np.clip(turn, -LARGEST_TURN, LARGEST_TURN)))
 
     def _take(self, obj: Any) -> None:
         """Another object; an outline that is being drawn is given up."""
-        if self._drawn is not None:
-            self._draw_outline(False)
+        self._drawing.end()
         self.session.change(object=obj, along=0.1, turn=0.0)
+        self._photo = None
         self.controls.learned.content = ""
         self.stage.show_object(obj)
         middle = obj.corners.mean(axis=0)
@@ -192,42 +201,30 @@ class Page:
         self.session.replay(interaction)
         self._begin_time()
 
+    def _take_photo(self, request: PhotoRequest) -> None:
+        """The object that a photograph shows, levered there."""
+        seen = request.observe()
+        self._take(checked(seen.placed.object))
+        self.session.take(seen.action)
+        self._photo = seen
+
+    def _take_example_photo(self) -> None:
+        request = self.controls.photo.take_example()
+        self.controls.height.value = round(1000 * request.height, 3)
+        self._take_photo(request)
+
     def _height(self) -> float:
         return 0.001 * float(self.controls.height.value)
 
-    def _draw_outline(self, begins: bool) -> None:
-        """Begin or end drawing."""
-        controls = self.controls
-        self._drawn = [] if begins else None
-        controls.draw.visible = not begins
-        controls.drawn.visible = controls.undraw.visible = begins
-        self.stage.clear(begins)
-        self.stage.show_drawing(np.zeros((0, 2)))
-        self._client.scene.remove_click_callback("all")
-        if begins:
-            self._client.scene.on_click()(self._add_corner)
-            self._message = "click the corners of an outline on the table, in order"
+    def _begin_outline(self) -> None:
+        self._drawing.begin(lambda event: self.act(lambda: self._add_corner(event)))
+        self._message = "click the corners of an outline on the table, in order"
 
     def _add_corner(self, event: Any) -> None:
-        origin, way = np.array(event.ray_origin), np.array(event.ray_direction)
-
-        def work() -> None:
-            if self._drawn is None or way[2] > -1e-6:
-                return
-            if len(self._drawn) >= MOST_CORNERS:
-                raise StudioError(f"the outline has {MOST_CORNERS} corners already: finish it")
-            self._drawn.append((origin - origin[2] / way[2] * way)[:2])
-            self.stage.show_drawing(np.array(self._drawn))
-            self._message = f"{len(self._drawn)} corners"
-
-        self.act(work)
+        self._message = self._drawing.add(event)
 
     def _finish_outline(self) -> None:
-        corners = np.array(self._drawn or []).reshape(-1, 2)
-        obj = prism_of(corners, self._height())
-        self._draw_outline(False)
-        self._message = ""
-        self._take(obj)
+        self._take(self._drawing.finish(self._height()))
 
     def _plan(self) -> None:
         self.controls.planned.content = "looking around ..."
@@ -251,12 +248,8 @@ class Page:
         self.session.plan = found
 
     def _simulate(self) -> None:
-        simulated, tried = self.session.simulate(), self.session.simulations
-        drawn = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in simulated.drawn.items())
-        text = f"**{simulated.interaction.effect.outcome}** in MuJoCo (green)"
-        if tried:
-            text += f"; the {LEVEL:.0%} region held {sum(tried)} of {len(tried)}"
-        self.controls.simulated.content = text + (f"\n\ndrawn: {drawn}" if drawn else "")
+        simulated = self.session.simulate()
+        self.controls.simulated.content = simulated_text(simulated, self.session.simulations)
 
     def _watch(self) -> None:
         self.session.watch(self.controls.wish.value)
@@ -282,7 +275,7 @@ class Page:
     def _draw(self) -> None:
         """Draw what follows from the choices; within a drag, this is what takes time."""
         session, controls, stage = self.session, self.controls, self.stage
-        if self._drawn is not None:
+        if self._drawing.active:
             controls.show_result(None, self._message)
             return
         action = session.action
@@ -328,12 +321,14 @@ class Page:
     def _draw_what_takes_time(self, number: int) -> None:
         """The twin's motion and the rim, unless the visitor has gone on meanwhile."""
         session, stage = self.session, self.stage
-        if self._drawn is not None:
+        if self._drawing.active:
             stage.show_rim(None)
             return
         for wanted, show in (
+            (self.controls.arm.value, self._draw_arm),
             (self.controls.rim.value, self._draw_rim),
             (self.controls.twin.value, self._draw_twin),
+            (self._photo is not None, self._draw_photo),
         ):
             if wanted and number == self._latest:
                 try:
@@ -342,11 +337,23 @@ class Page:
                     self.controls.show_result(None, str(error))
         if not self.controls.rim.value:
             stage.show_rim(None)
+        if not self.controls.arm.value:
+            stage.show_arm(None)
+        if self._photo is None:
+            self.controls.photo.show(None)
         with suppress(ForetraceError):
             self.controls.show_result(session.imagined, self._message)
 
     def _draw_rim(self) -> None:
         self.stage.show_rim(self.session.rim)
+
+    def _draw_arm(self) -> None:
+        self.stage.show_arm(self.session.choices.path)
+        self.stage.show_time(float(self.controls.time.value))
+
+    def _draw_photo(self) -> None:
+        if self._photo is not None:
+            self.controls.photo.show(picture_of(self._photo, self.session.action, self.session.imagined))
 
     def _draw_twin(self) -> None:
         action = self.session.action
@@ -367,22 +374,13 @@ class Page:
         now, last = float(self.controls.time.value), perf_counter()
         while not self._closed.wait(FRAME):
             elapsed, last = perf_counter() - last, perf_counter()
-            if not self.controls.play.value or self._drawn is not None:
+            if not self.controls.play.value or self._drawing.active:
                 now = float(self.controls.time.value)
                 continue
             end = float(self.controls.time.max)
             now = 0.0 if now > end + PAUSE else now + elapsed
             self.controls.time.value = min(round(now / 0.05) * 0.05, end)
             self._show_time(min(now, end))
-
-
-def plan_text(found: Plan) -> str:
-    """A plan in a few lines of Markdown."""
-    lines = [f"**{found.goal}**: reached with a probability of {found.reached:.0%}"]
-    lines += [f"probability of {name}: {chance:.1%}" for name, chance in found.chances.items()]
-    lines += [f"*{found.note}*"] if found.note else []
-    lines += [f"{k}. {other.lost}" for k, other in enumerate(found.alternatives, start=2)]
-    return "\n\n".join(lines)
 
 
 def _on(handle: Any, work: Callable[[], None]) -> None:

@@ -32,6 +32,8 @@ WORLDS = 128
 """Worlds of a belief that a monitor compares an execution with."""
 LEVER_UPS = 3
 """Lever-ups from which constants are learned."""
+NEAREST = 1e-3
+"""Points nearer to the contact than this say no direction [m]."""
 LOOK_AROUND = PlanConfig(refine=0, check=0)
 """What colours the rim: the first stage of a plan alone."""
 
@@ -102,6 +104,21 @@ class Session:
         point = finite_array("the contact (x, y) [m]", point, (2,), StudioError)
         ring = shapely.LinearRing(self.choices.object.corners)
         self.change(along=float(ring.project(shapely.Point(point)) / ring.length))
+
+    def turn_from(self, point: Numbers) -> None:
+        """Turn the direction as if the tool came from a point [m], object frame, as far as it may be turned.
+
+        Raises:
+            StudioError: The point is no two finite numbers.
+        """
+        point = finite_array("the point (x, y) [m]", point, (2,), StudioError)
+        action = self.action
+        way = action.contact - point
+        if np.linalg.norm(way) < NEAREST:
+            return
+        change = np.arctan2(way[1], way[0]) - np.arctan2(action.direction[1], action.direction[0])
+        turn = self.choices.turn + (change + np.pi) % (2 * np.pi) - np.pi
+        self.change(turn=float(np.clip(turn, -LARGEST_TURN, LARGEST_TURN)))
 
     def take(self, action: Action) -> None:
         """Choose contact, direction and path of a lever-up on this object."""

@@ -104,11 +104,8 @@ def from_file(
         StudioError: The file is too large, or a mask comes without a scale.
         ShapeError: It holds no object.
     """
-    if len(content) > MOST_BYTES:
-        raise StudioError(
-            f"{PurePath(name).name} has {len(content) / 2**20:.1f} MB: give at most {MOST_BYTES >> 20} MB"
-        )
-    with _written(name, content) as file:
+    check_bytes(name, content)
+    with written(name, content) as file:
         if file.suffix.lower() in IMAGES:
             if scale is None:
                 raise StudioError(f"{file.name} is a mask: give its scale, the metres per pixel")
@@ -118,6 +115,21 @@ def from_file(
         else:
             found = read_shape(file, height, scale)
     return checked(found)
+
+
+def check_bytes(name: str, content: bytes) -> None:
+    """Refuse a file that is too large.
+
+    Raises:
+        StudioError: It has more than `MOST_BYTES`.
+    """
+    if len(content) > MOST_BYTES:
+        raise StudioError(too_large(name, len(content)))
+
+
+def too_large(name: str, size: int) -> str:
+    """What is said of a file that is too large."""
+    return f"{PurePath(name).name} has {size / 2**20:.1f} MB: give at most {MOST_BYTES >> 20} MB"
 
 
 def checked(obj: ObjectModel) -> ObjectModel:
@@ -136,8 +148,8 @@ def checked(obj: ObjectModel) -> ObjectModel:
 
 
 @contextmanager
-def _written(name: str, content: bytes) -> Iterator[Path]:
-    """A file of that content; errors name it without its folder."""
+def written(name: str, content: bytes) -> Iterator[Path]:
+    """A file of that content while it is needed; errors name it without its folder."""
     ending = "".join(letter for letter in PurePath(name).suffix if letter.isalnum() or letter == ".")[:10]
     stem = "".join(letter for letter in PurePath(name).stem if letter.isalnum() or letter in "-_ ")[:60]
     with TemporaryDirectory(prefix="foretrace-") as folder:

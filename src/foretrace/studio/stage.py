@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import to_rgb
 
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, ToolPath
 from foretrace.geometry import matrix_to_pose
 from foretrace.objects import ObjectModel
 from foretrace.objects.surface import triangles_of
@@ -20,6 +20,7 @@ from foretrace.pictures.style import (
     TRUTH_COLOR,
 )
 from foretrace.planning import RimCost
+from foretrace.studio.arm import ShownArm
 from foretrace.studio.scenery import (
     MOST_FUTURES,
     Moving,
@@ -37,8 +38,8 @@ GRIP_BEHIND, GRIP_RADIUS = 0.05, 0.007
 """The grip lies so far behind the contact; its radius [m]."""
 CAMERA, LOOK_AT = (0.14, -0.3, 0.22), (0.0, 0.0, 0.02)
 """Where the camera is at first, and what it looks at [m]."""
-TABLE_SIZE = (0.9, 0.9, 0.012)
-"""The table [m]."""
+TABLE_SIZE, TABLE_WITH_ARM = (0.9, 0.9, 0.012), (2.4, 2.4, 0.012)
+"""The table, and the one on which the arm stands, too [m]."""
 WIDE = 0.05
 """Of futures beside the expected one, wider tubes are left out: they would hide everything [m]."""
 LABEL = 0.022
@@ -76,10 +77,8 @@ class Stage:
         self._times = np.zeros(0)
         client.camera.position, client.camera.look_at = CAMERA, LOOK_AT
         client.camera.near, client.camera.min_orbit_distance = 0.005, 0.05
-        x, y, z = TABLE_SIZE
-        self._scene.add_box(
-            "/table", dimensions=(x, y, z), position=(0, 0, -z / 2), color=TABLE, cast_shadow=False
-        )
+        self._show_table(TABLE_SIZE)
+        x, y, _ = TABLE_SIZE
         self._scene.add_grid(
             "/grid", width=x, height=y, cell_size=0.01, section_size=0.1, cell_color=(178, 182, 188),
             section_color=(160, 165, 172), cell_thickness=0.6, position=(0, 0, 0.0003), shadow_opacity=0.0,
@@ -88,6 +87,11 @@ class Stage:
         self.parts: list[Any] = []
         self.grip = self._scene.add_icosphere("/grip", radius=GRIP_RADIUS, color=GRIP)
         self._add_tool()
+        self._arm = ShownArm(self._scene)
+
+    def _show_table(self, size: tuple[float, float, float]) -> None:
+        middle = (0, 0, -size[2] / 2)
+        self._scene.add_box("/table", dimensions=size, position=middle, color=TABLE, cast_shadow=False)
 
     def _add_tool(self) -> None:
         for part in LeverUp((0, 0), (1, 0)).tool.parts():
@@ -142,6 +146,7 @@ class Stage:
     def show_contact(self, action: LeverUp, times: Float[np.ndarray, " time"]) -> None:
         """Where the blade meets the object, and how it moves."""
         self._times, self._tool_poses = times, tool_poses_of(action, times)
+        self._arm.place(action)
         tail = action.contact - GRIP_BEHIND * action.direction
         self.grip.position = (*tail.tolist(), GRIP_RADIUS)
         arrow = np.array([[[*tail, 0.0015], [*(action.contact - 0.004 * action.direction), 0.0015]]])
@@ -171,6 +176,19 @@ class Stage:
         """The motion of the ``twin``, or the ``simulated`` one; None: none."""
         self._put(f"/{name}", moving)
         self._path(f"/{name}_path", moving, TWIN if name == "twin" else colour_of(TRUTH_COLOR))
+
+    def show_arm(self, path: ToolPath | None) -> None:
+        """The arm that leads the screwdriver along a path; None: the screwdriver alone.
+
+        Raises:
+            ActionError: The arm cannot follow the path.
+        """
+        if (path is not None) != self._arm.visible:
+            self._show_table(TABLE_SIZE if path is None else TABLE_WITH_ARM)
+        if path is None:
+            self._arm.hide()
+        else:
+            self._arm.follow(path)
 
     def show_rim(self, rim: RimCost | None) -> None:
         """Cost of each contact around the object; None: no rim."""
@@ -205,6 +223,7 @@ class Stage:
             for other in ("twin", "simulated"):
                 self.show_other(other, None)
             self.show_rim(None)
+            self.show_arm(None)
             self._scene.get_handle_by_name("/object").visible = False
 
     # --- when ----------------------------------------------------------------------------------------------
@@ -216,6 +235,7 @@ class Stage:
         k = int(np.abs(self._times - time).argmin())
         with self._moving, self._client.atomic():
             _place(self.tool, self._tool_poses[k])
+            self._arm.show_time(time)
             for handle, moving in self._movers.values():
                 _place(handle, moving.poses[min(k, len(moving.poses) - 1)])
 

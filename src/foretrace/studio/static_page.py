@@ -33,10 +33,11 @@ from foretrace.pictures.style import OBJECT_EDGE, OUTCOME_COLORS, SUPPORT_COLOR
 from foretrace.predictor.portable import OnnxPredictor
 from foretrace.studio import stage
 from foretrace.studio.choices import FIRST, LIMITS, PHYSICS, Choices
-from foretrace.studio.controls import KNOBS, LEAST_SHOWN
+from foretrace.studio.controls import KNOBS
 from foretrace.studio.scenery import LEAST_PROBABLE, MOST_FUTURES, MOST_UPRIGHTS
 from foretrace.studio.session import LEVEL, learned
 from foretrace.studio.shapes import EXAMPLES, MOST_CORNERS
+from foretrace.studio.texts import LEAST_SHOWN
 
 RUNTIME = "onnxruntime-web@1.30.0"
 """The package of npm that runs the network in a browser (MIT licence)."""
