@@ -10,10 +10,12 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from foretrace.cli.console import say
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
-from foretrace.errors import PlanningError
+from foretrace.cli.plan_many import EveryOptions, Task, plan_every
+from foretrace.errors import DatasetError, PlanningError
 from foretrace.imagined.shown import radius_of
 from foretrace.perception.photo import PhotoConfig
 from foretrace.planning import PlanConfig, goals
+from foretrace.urls import as_place
 
 if TYPE_CHECKING:
     from foretrace.imagined import Imaginer
@@ -139,6 +141,7 @@ def plan(
     physics: Annotated[OmitArgPrefixes[PhysicsOptions], arg(name="physics")],
     search: Annotated[OmitArgPrefixes[PlanConfig], arg(name="search")],
     run: Positional[Path | None] = None,
+    many: Annotated[OmitArgPrefixes[EveryOptions], arg(name="many objects")] = EveryOptions(),  # noqa: B008
     action: ActionName = "lever-up",
     steps: int = 1,
     unknown: bool = False,
@@ -155,24 +158,31 @@ def plan(
         where: The object of a data set; where the object and the arm are.
         physics: What is known of the physics; by default the nominal constants.
         search: How candidates are searched.
+        many: Plans for every object of a data set.
         run: Folder of a training that imagines; by default the predictor that comes with foretrace.
         action: What the object is moved by. Pushes are imagined by the quasi-static twin.
         steps: Actions in a row, at most. With more than one, they are planned until the object rests after each:
             plan.json has the first, sequence.json all of them.
         unknown: Tell the imaginers only the constants that are given here; by default the others are the nominal ones.
             Each push is then imagined 32 times: with --steps, a plan may take a minute; --spacing 0.02 makes it faster.
-        out: Folder for plan.json and plan.png.
+        out: Folder for plan.json and plan.png, or plans.csv.
     """
     from foretrace.interactions.recording_folder import write_image
     from foretrace.planning import plan as choose
 
     goal = aim.load()
-    seen, thing, T_table_object = _observe(obj, photo, where)
+    if many.every:
+        _refuse_with_every(obj, photo, where, steps)
+        seen = thing = T_table_object = None
+    else:
+        if idle := [_option(name) for name in ("workers", "cluster") if getattr(many, name) is not None]:
+            raise PlanningError(f"{' and '.join(idle)} without --every: leave it out")
+        seen, thing, T_table_object = _observe(obj, photo, where)
     given = {name: value for name, value in asdict(physics).items() if value is not None}
     for name, value in given.items():
         if not 0 < value < float("inf"):
             raise PlanningError(f"{_option(name)} is {value}: give a number above 0")
-    predictor = _imaginer(run, action, steps)
+    predictor = imaginer_of(run, action, steps)
     if idle := [_option(name) for name in given if name not in predictor.context]:
         raise PlanningError(
             f"{' and '.join(idle)}: the {predictor.name} imaginer is not conditioned on it, leave it out"
@@ -181,6 +191,10 @@ def plan(
     if given or unknown:
         usual = {} if unknown else dict(predictor.nominal)
         told = {name: value for name, value in (usual | given).items() if name in predictor.context}
+    if thing is None:
+        task = Task(run, action, goal, told, search)
+        plan_every(as_place(where.data, DatasetError), task, out, many)
+        return
     if steps != 1:
         _plan_several(thing, goal, steps, predictor, told, search, where, out)
         return
@@ -207,7 +221,25 @@ def plan(
     print("\n".join(str(out / name) for name in written))
 
 
-def _imaginer(run: Path | None, action: ActionName, steps: int) -> "Imaginer":
+def _refuse_with_every(obj: ObjectOptions, photo: PhotoOptions, where: PlaceOptions, steps: int) -> None:
+    """Refuse options that are about one object.
+
+    Raises:
+        PlanningError: Naming them.
+    """
+    if where.data is None:
+        raise PlanningError("--every plans for the objects of a data set: give it as --data")
+    one = {name for name in ("id", "pose", "base") if getattr(where, name) is not None}
+    one |= {name for name, value in vars(obj).items() if value != getattr(ObjectOptions(), name)}
+    one |= {"photo"} if photo.photo is not None else set()
+    one |= {"steps"} if steps != 1 else set()
+    if one:
+        raise PlanningError(
+            f"{' and '.join(map(_option, sorted(one)))} goes with one object: leave out --every or it"
+        )
+
+
+def imaginer_of(run: Path | None, action: ActionName, steps: int) -> "Imaginer":
     """What imagines actions of a kind, to rest if there are several."""
     if run is not None and (action == "push" or steps != 1):
         raise PlanningError(f"{run} learned single lever-ups: leave it out, or --action push and --steps")

@@ -1,18 +1,20 @@
 """The command that trains predictors. Its options are the settings of the chosen predictor and of the training loop."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import field, fields, make_dataclass, replace
+import warnings
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from functools import partial
 from inspect import Parameter, getdoc, signature
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
 import docstring_parser
 from tyro.conf import OmitArgPrefixes, arg
 
 from foretrace import predictor as learned
-from foretrace.cli.console import when_interrupted
+from foretrace.cli.console import say, when_interrupted
 from foretrace.cli.parsing import adapt
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, TrainingError
 from foretrace.features import FEATURES, FeatureExtractor
 from foretrace.files import write_text
 from foretrace.interactions.dataset import Dataset
@@ -22,10 +24,40 @@ from foretrace.predictor import PREDICTORS, PredictorConfig, TrainConfig
 from foretrace.predictor.config import feature_option
 from foretrace.predictor.model_card import RECALIBRATED, model_card, recalibration_section
 from foretrace.predictor.recalibration import SHOWN_LEVELS
-from foretrace.predictor.run_folder import RunFolder
+from foretrace.predictor.run_folder import RunFolder, first_of
 from foretrace.urls import Url, as_place
+from foretrace.workers import ProgressReport, count_workers, on_cluster, run_jobs
 
 CARD = "MODEL_CARD.md"
+
+
+@dataclass(frozen=True)
+class SeedOptions:
+    """Trainings that differ in their seed."""
+
+    seeds: tuple[int, ...] = ()
+    """A training for each of these seeds, in folders seed-N of --out, in place of --seed; the same models as one by
+    one with --threads 1."""
+    workers: int | None = None
+    """Trainings at the same time, with --seeds; by default one for each core."""
+    cluster: str | None = None
+    """Address of a Ray cluster that trains, with --seeds: HOST:PORT, ray://HOST:PORT, or local:N."""
+
+    def check(self, named: Container[str]) -> None:
+        """Refuse options that do not go together.
+
+        Args:
+            named: Options that were given.
+
+        Raises:
+            TrainingError: Naming them.
+        """
+        if self.seeds and "--seed" in named:
+            raise TrainingError("--seed and --seeds do not go together: leave one out")
+        if not self.seeds and (idle := [name for name in ("--workers", "--cluster") if name in named]):
+            raise TrainingError(
+                f"{' and '.join(idle)} without --seeds: one training is one process, leave it out"
+            )
 
 
 def train_command(words: Sequence[str]) -> Callable[..., None]:
@@ -55,18 +87,25 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         split: tuple[int, int, int] | None = None,
         fresh: bool = False,
         card: bool = False,
+        several: Annotated[OmitArgPrefixes[SeedOptions], arg(name="several seeds")] = SeedOptions(),
     ) -> None:
         values = [(each, getattr(extractor, each.name)) for each in fields(extractor)]
         given = {each.metadata["name"]: value for each, value in values if value != each.default}
         place = as_place(data, DatasetError)
         named = {word.partition("=")[0] for word in words if word.startswith("--")}
+        several.check(named)
+        folders = [out]
         if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
             if "--epochs" in named and "--min-steps" not in named:
                 training = replace(training, min_steps=1)  # who asks for one epoch gets one
-            _train(place, out, replace(config, feature_options=given), training, split, fresh)
-        if card:
-            write_text(out / CARD, model_card(out, place))
-            print(out / CARD)
+            config = replace(config, feature_options=given)
+            if several.seeds:
+                folders = _train_seeds(place, out, config, training, split, fresh, several)
+            else:
+                _train(place, out, config, training, split, fresh)
+        for folder in folders if card else ():
+            write_text(folder / CARD, model_card(folder, place))
+            print(folder / CARD)
 
     train.__doc__ = f"""Train a predictor on a data set.
 
@@ -85,6 +124,7 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         fresh: Discard the training in the folder instead of continuing it.
         card: Write a model card to the folder, too: data, errors and calibration on the test part, limits. A finished
             training needs no other options than --data and --out.
+        several: Trainings with several seeds.
     """
     train.__annotations__ |= {
         "config": Annotated[OmitArgPrefixes[config_class], arg(name=label)],
@@ -157,12 +197,95 @@ def _train(
     split: tuple[int, int, int] | None,
     fresh: bool,
 ) -> None:
+    """Train one predictor."""
+    training = replace(training, first=_first(data, [out], training, fresh))
+    with when_interrupted(f"the best model so far is in {out}, the same command goes on from there"):
+        _train_one(data, config, split, fresh, True, (out, training))
+    print(f"predictor: {out}")
+
+
+def _train_seeds(
+    data: Path | Url,
+    out: Path,
+    config: PredictorConfig,
+    training: TrainConfig,
+    split: tuple[int, int, int] | None,
+    fresh: bool,
+    several: "SeedOptions",
+) -> list[Path]:
+    """Train a predictor for each seed, in a folder each; the folders."""
+    folders = [out / f"seed-{seed}" for seed in several.seeds]
+    if len(set(folders)) < len(folders):
+        raise TrainingError(f"--seeds {' '.join(map(str, several.seeds))} names a seed twice: name each once")
+    threads = training.threads or 1
+    training = replace(training, first=_first(data, folders, training, fresh), threads=threads)
+    jobs = [
+        (folder, replace(training, seed=seed)) for folder, seed in zip(folders, several.seeds, strict=True)
+    ]
+    function = partial(_train_one, data, config, split, fresh, False)
+    with (
+        when_interrupted(f"the best models so far are in {out}, the same command goes on from there"),
+        on_cluster(several.cluster),
+        ProgressReport("trainings", len(jobs), period=0.0) as report,
+    ):
+        workers = count_workers(several.workers, TrainingError)
+        for folder in run_jobs(function, jobs, workers, error=TrainingError, threads=threads, ahead="n_jobs"):
+            report.add(1, str(folder))
+    for folder in folders:
+        print(f"predictor: {folder}")
+    return folders
+
+
+def _train_one(
+    data: Path | Url,
+    config: PredictorConfig,
+    split: tuple[int, int, int] | None,
+    fresh: bool,
+    progress: bool,
+    job: tuple[Path, TrainConfig],
+) -> Path:
+    """Train into a folder, in any process; the folder."""
+    out, training = job
     outcomes = training.outcomes or getattr(config, "outcomes", None) or (str(Outcome.LEVERED),)
-    everything = Dataset.open(data)
+    everything = cast(Dataset, first_of(_open(data), training.first))
     # Without any of them the training itself says which outcomes there are.
     dataset = everything.where(outcome=outcomes) or everything
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
-    with when_interrupted(f"the best model so far is in {out}, the same command goes on from there"):
-        learned.train_predictor(dataset, config, out, replace(training, split=split), resume=not fresh)
-    print(f"predictor: {out}")
+    training = replace(training, split=split)
+    return learned.train_predictor(dataset, config, out, training, resume=not fresh, progress=progress)
+
+
+def _open(data: Path | Url) -> Dataset:
+    """A data set, without a word on what is missing, which `_first` has."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".* is not finished: ")
+        return Dataset.open(data)
+
+
+def _first(data: Path | Url, folders: Sequence[Path], training: TrainConfig, fresh: bool) -> int | None:
+    """Number below which interactions are looked at.
+
+    As asked for; or as when the training began; or, of a data set that is still being written, up to where it is
+    complete.
+
+    Raises:
+        DatasetError: It has no complete shard at its beginning.
+    """
+    if training.first is not None:
+        return training.first
+    noted = (None if fresh else RunFolder(folder).first for folder in folders)
+    if (first := next(filter(None, noted), None)) is not None:
+        return first
+    dataset = _open(data)
+    if (first := dataset.complete_until) is None:
+        return None
+    total = dataset.manifest["num_trials"]
+    if first == 0:
+        raise DatasetError(
+            f"{data} has no complete shard at its beginning yet: wait, or finish the simulation"
+        )
+    say(
+        f"{data} has its first {first} of {total} interactions so far: trained on these, as with --first {first}"
+    )
+    return first

@@ -208,6 +208,13 @@ class Dataset:
             pa.default_memory_pool().release_unused()
 
     @property
+    def complete_until(self) -> int | None:
+        """Number of its first interactions that are there while others are still to come; None: all are there."""
+        if not (missing := storage.missing_shards(self.manifest)):
+            return None
+        return int(missing[0].removesuffix(".parquet").rpartition("-")[2]) * self.manifest["shard_size"]
+
+    @property
     def ids(self) -> Int[np.ndarray, " batch"]:
         """Number of each interaction within its data set."""
         return self.index["id"].to_numpy()

@@ -97,6 +97,9 @@ class TrainConfig:
     """Outcomes of the interactions to learn from; None: those that the predictor distinguishes, else levered."""
     split: tuple[int, int, int] | None = PAPER_SIZES
     """Sizes of the training, validation and test parts; None: in the paper's proportions."""
+    first: int | None = None
+    """Number below which interactions are looked at, the first ones of the data set; None: all of them, or of a data
+    set that is not finished those up to its first missing shard."""
     seed: int = 0
     """Seed of the split, the first weights, the order and the dropout."""
     device: Device = "auto"
@@ -123,6 +126,8 @@ class TrainConfig:
                 raise TrainingError(f"split is {shown(self.split)}: give the sizes of three parts")
             for size in self.split:
                 check_count("a part of the split", size, 1_000_000_000)
+        if self.first is not None:
+            check_count("first", self.first, 10**12)
         check_count("seed", self.seed, 2**63 - 1, least=0)
         check_choice("device", self.device, get_args(Device))
         check_choice("precision", self.precision, get_args(TrainingPrecision))

@@ -18,7 +18,7 @@ from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, pa
 from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, read_config
 from foretrace.predictor.config import feature_option
 from foretrace.predictor.recalibration import SHOWN_LEVELS
-from foretrace.predictor.run_folder import ENVIRONMENT
+from foretrace.predictor.run_folder import ENVIRONMENT, RunFolder
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
 from foretrace.urls import Url
@@ -65,7 +65,7 @@ def model_card(run: Path, data: Path | Url) -> str:
         f"Model card: {predictor.label} predictor with features {predictor.features.label}": _about(
             predictor
         ),
-        "Data": _data(dataset, data, parts, families),
+        "Data": _data(dataset, data, parts, families, RunFolder(run).first),
         "Training": _training(run, data),
         "Errors on the test part": _errors(predictor, test, families),
         "Outcomes and regions on the test part": _calibration(predictor, test),
@@ -90,7 +90,11 @@ def _about(predictor: EffectPredictor) -> str:
 
 
 def _data(
-    dataset: Dataset, data: Path | Url, parts: Mapping[str, InteractionBatch], families: Mapping[int, str]
+    dataset: Dataset,
+    data: Path | Url,
+    parts: Mapping[str, InteractionBatch],
+    families: Mapping[int, str],
+    first: int | None,
 ) -> str:
     chosen = ", ".join(_settings(dataset.manifest["configuration"]))
     rows = []
@@ -100,7 +104,10 @@ def _data(
             if any(counts):
                 rows.append([outcome, family, *map(str, counts)])
     rows.append(["all", "", *(str(len(batch)) for batch in parts.values())])
-    return f"`{data.name}`, simulated with: {chosen}.\n\n" + _table(["Outcome", "Objects", *PARTS], rows)
+    looked_at = "" if first is None else f", the first {first} interactions"
+    return f"`{data.name}`{looked_at}, simulated with: {chosen}.\n\n" + _table(
+        ["Outcome", "Objects", *PARTS], rows
+    )
 
 
 def _training(run: Path, data: Path | Url) -> str:

@@ -17,7 +17,7 @@ from msgspec import Meta
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from foretrace.errors import DatasetError, TrainingError, shown
+from foretrace.errors import DatasetError, ForetraceError, TrainingError, is_whole, shown
 from foretrace.files import (
     as_json,
     first_difference,
@@ -170,6 +170,15 @@ class RunFolder:
             )
 
     @property
+    def first(self) -> int | None:
+        """Number below which the training in the folder looks at interactions; None: at all, or there is none."""
+        try:
+            found = read_config(self.path).get("training", {}).get("first")
+        except ForetraceError:
+            return None
+        return found if is_whole(found, 1, 10**12) else None
+
+    @property
     def threads(self) -> int | None:
         """Threads that the training in the folder runs with; None: not known."""
         try:
@@ -258,6 +267,13 @@ class RunFolder:
         (self.path / RESUME).unlink(missing_ok=True)
 
 
+def first_of(source: Source, first: int | None) -> Source:
+    """The interactions whose numbers are below a given one; None: all."""
+    if first is None or (source.ids < first).all():
+        return source
+    return source[np.flatnonzero(source.ids < first)]
+
+
 def fingerprint(source: Source, context: Sequence[str] = ()) -> str:
     """A short hash of everything in interactions that a training can read, and of the context it is conditioned on."""
     return short_hash(_contents(source, context))
@@ -336,6 +352,7 @@ def _rows_of(run: str | Path, data: Source, part: str) -> Source:
     parts, prints = _read_split(run)
     if part not in parts or part not in prints:
         raise TrainingError(f"{Path(run) / SPLIT} has no part {shown(part)}; it has: {', '.join(parts)}")
+    data = first_of(data, RunFolder(run).first)
     rows = np.flatnonzero(np.isin(data.ids, parts[part]))
     _ = data.times  # those of the whole from here on, even if the part's longest trajectory is shorter
     if len(rows) != len(parts[part]):

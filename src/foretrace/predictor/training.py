@@ -34,7 +34,15 @@ from foretrace.predictor.parts import (
     prepare,
     usable_lengths,
 )
-from foretrace.predictor.run_folder import TENSORBOARD, Progress, Row, RunFolder, Source, fingerprint
+from foretrace.predictor.run_folder import (
+    TENSORBOARD,
+    Progress,
+    Row,
+    RunFolder,
+    Source,
+    fingerprint,
+    first_of,
+)
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
 from foretrace.predictor.states import state_statistics
 from foretrace.trajectories import final_distance, mean_distance
@@ -68,8 +76,8 @@ def fit_predictor(
         batch: The interactions.
         predictor: Its settings, or an untrained predictor, which is trained in place.
         split: Rows of ``batch`` in each part, all with at least two valid samples.
-        training: Settings of the loop, of which ``split`` and ``outcomes`` are not looked at; by default those that the
-            predictor's settings recommend.
+        training: Settings of the loop, of which ``split``, ``outcomes`` and ``first`` are not looked at; by default
+            those that the predictor's settings recommend.
         inputs: The features' ``inputs`` of the whole ``batch``, where they are known already.
         fitted: Folder that keeps what feature extractors have learned on their own, for further trainings on the
             same parts and seed.
@@ -114,8 +122,8 @@ def train_predictor(
             ``environment.json``, ``split.json`` and TensorBoard events.
         training: Settings of the loop; by default those that the predictor's settings recommend.
         resume: Go on with an unfinished training in ``out``; otherwise discard it.
-        split: Rows of ``data`` in each part, all with at least two valid samples; drawn by the seed among the
-            chosen outcomes if not given.
+        split: Rows of ``data``, or of its first ones if ``training`` says so, in each part, all with at least two valid
+            samples; drawn by the seed among the chosen outcomes if not given.
         progress: Show a progress bar.
 
     Returns:
@@ -128,6 +136,7 @@ def train_predictor(
     check_type("data", data, (InteractionBatch, Dataset), TrainingError)
     training = _loop_settings(predictor, training)
     check_type("split", split, (Split, type(None)), TrainingError)
+    data = first_of(data, training.first)
     source = data.batch() if isinstance(data, Dataset) and len(data) <= IN_MEMORY else data
     folder = RunFolder(as_path(out, TrainingError))
     threads = training.threads or (folder.threads if resume else None)
