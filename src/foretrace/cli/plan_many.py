@@ -13,6 +13,7 @@ import numpy as np
 
 from foretrace.cli.console import when_interrupted
 from foretrace.errors import ForetraceError, PlanningError, counted
+from foretrace.extras import named_extras
 from foretrace.files import (
     as_json,
     first_difference,
@@ -25,7 +26,6 @@ from foretrace.files import (
 )
 from foretrace.planning import PlanConfig, goals
 from foretrace.urls import Url
-from foretrace.workers import ProgressReport, count_workers, on_cluster, run_jobs
 
 if TYPE_CHECKING:
     from foretrace.imagined import Imaginer
@@ -98,6 +98,9 @@ def plan_every(data: Path | Url, task: Task, out: Path, many: EveryOptions) -> N
     Raises:
         PlanningError: The folder holds other plans.
     """
+    with named_extras():
+        from foretrace.workers import ProgressReport, count_workers, on_cluster, run_jobs
+
     objects = _objects(data)
     settings = asdict(task) | {"data": str(data), "goal": str(task.goal), "run": task.run and str(task.run)}
     rows = out / ROWS
