@@ -9,7 +9,7 @@ from PIL import Image
 
 from foretrace import cli
 from foretrace.errors import ResultsError
-from foretrace.evaluation.charts import STYLES, family_of, present, seeds_in_words, style_of
+from foretrace.evaluation.charts import STYLES, columns_of, family_of, present, seeds_in_words, style_of
 from foretrace.evaluation.run import run_experiment, write_figures
 from foretrace.evaluation.storage import REPORT, ROWS, SUMMARY, summary_content
 from foretrace.experiments.paper import Paper
@@ -87,6 +87,34 @@ def test_one_state_at_once_comes_from_the_same_seeds(table):
     assert fig is not None
     assert "over 3 seeds" in words(fig)
     assert fig.axes[0].get_ylim()[1] < 1
+
+
+def test_a_predictor_of_another_family_has_a_panel_of_its_own(table):
+    rows = table[table["experiment"].eq("training-size")]
+    fig = FIGURES["figure-11"](
+        pd.concat([rows, rows[rows["features"].eq("sp-pred")].assign(features="one-shot")])
+    )
+    assert fig is not None
+    panels = {ax.get_title(loc="left"): [text.get_text() for text in ax.texts] for ax in fig.axes}
+    assert [name for name, shown in panels.items() if "one-shot" in shown] == ["Direct"]
+
+
+@pytest.mark.parametrize("name", ["figure-10-by-object", "figure-11", "figure-12"])
+def test_panels_of_a_figure_have_the_same_ticks_and_show_all(table, name):
+    fig = FIGURES[name](table)
+    assert fig is not None
+    assert len({tuple(ax.get_yticks()) for ax in fig.axes}) == 1
+    for ax in fig.axes:
+        drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
+        assert np.nanmax(drawn) <= ax.get_ylim()[1]
+
+
+def test_no_entry_of_a_legend_stands_alone():
+    assert columns_of(12) == 12
+    for count in range(2, 60):
+        columns = columns_of(count)
+        assert columns <= 12
+        assert (count - 1) % columns > 0
 
 
 def test_seeds_are_counted():

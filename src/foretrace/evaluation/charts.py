@@ -58,6 +58,8 @@ FAMILIES = {
 }
 """What is drawn side by side; `OTHER` takes whatever is in none of them."""
 MARKERS = "dHX8<>^v"
+MOST_COLUMNS = 12
+"""Entries side by side in a legend."""
 GRID = "#e6e8ec"
 QUIET = "#5b6472"
 REFERENCE: dict[str, Any] = {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2))}
@@ -187,7 +189,14 @@ def legend(fig: Figure, names: Iterable[str], extra: Sequence[Line2D] = (), *, l
         )
         for name in names
     ]
-    fig.legend(handles=[*handles, *extra], loc="outside lower center", ncols=12, columnspacing=1.2)
+    shown = [*handles, *extra]
+    fig.legend(handles=shown, loc="outside lower center", ncols=columns_of(len(shown)), columnspacing=1.2)
+
+
+def columns_of(count: int) -> int:
+    """Columns of a legend of so many entries: rows as equally long as can be, so that none is left alone."""
+    lines = max(1, -(-count // MOST_COLUMNS))
+    return max(1, -(-count // lines))
 
 
 def reference(ax: Axes, at: float) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter
 from scipy.stats import kstest
 
 from foretrace.actions import LeverUp
@@ -199,6 +200,7 @@ class Identification(Experiment):
             ax.plot([k - 0.25, k + 0.25], [values[name].mean()] * 2, color=color, linewidth=2.5)
         ax.set_xticks(range(len(names)), [name.removeprefix("error ") for name in names])
         ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         grid(ax, ylabel="error of other lever-ups [cm]")
         finish(
             fig, "What was learned, on other lever-ups of the same object", "lines: means; points: objects"

@@ -70,7 +70,8 @@ def paths_figure(paths: pd.DataFrame) -> Figure:
     """Observed and imagined paths of objects that look alike, from the side (paper, figure 16, right)."""
     kinds = list(dict.fromkeys(paths["kind"]))
     fig = new_figure(4.2 * len(kinds), 4.0)
-    for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False, sharey=True)[0], kinds, strict=True):
+    axes = fig.subplots(1, len(kinds), squeeze=False, sharex=True, sharey=True)[0]
+    for ax, kind in zip(axes, kinds, strict=True):
         mine = paths.loc[paths["kind"].eq(kind)]
         for name, (color, style, width) in PATHS.items():
             path = mine.loc[mine["path"].eq(name), ["x_cm", "z_cm"]].to_numpy(float)
@@ -92,6 +93,6 @@ def paths_figure(paths: pd.DataFrame) -> Figure:
     ]
     handles.append(Line2D([], [], color=INK, marker="s", linestyle="none", label="at rest"))
     fig.legend(handles=handles, loc="outside lower center", ncols=4)
-    note = "A lever-up of the test part at one contact; each panel has its own scale along x"
-    finish(fig, "One mask, three motions: paths of the centre of mass from the side", note)
+    title = "One mask, three motions: paths of the centre of mass from the side"
+    finish(fig, title, "A lever-up of the test part at one contact")
     return fig

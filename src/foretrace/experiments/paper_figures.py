@@ -44,7 +44,8 @@ PANELS = {
     "Shape context": SHAPE_CONTEXTS,
     "Autoencoder": AUTOENCODERS,
     "Supervised": SUPERVISED,
-    "Support points": (*TASK_SPECIFIC, "sp-rule", "one-shot"),
+    "Support points": (*TASK_SPECIFIC, "sp-rule"),
+    "Direct": ("one-shot",),
 }
 """Predictors that share a panel where there is one for each family."""
 ERRORS = {"full": "error, full trajectory [cm]", "final": "error, final position [cm]"}
@@ -141,9 +142,11 @@ def figure_10_by_object(table: pd.DataFrame) -> Figure | None:
     if all(rows.empty for rows in by_object.values()):
         return None
     fig = new_figure(13.2, 4.5)
-    for ax, (metric, rows) in zip(fig.subplots(1, 2), by_object.items(), strict=True):
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, (metric, rows) in zip(axes, by_object.items(), strict=True):
         draw_boxes(ax, rows, present(rows), rows_of(table, "features", metric, ["shuffled"]))
         ax.set_ylabel(ERRORS[metric])
+    axes[0].set_ylim(0, 1.08 * max(rows["value"].max() for rows in by_object.values()))
     finish(fig, "Prediction error on objects that were not learned from",
            f"boxes, whiskers to the extremes, and every seed; {seeds_in_words(pd.concat(by_object.values()))}; "
            "black: mean with all interactions shuffled, as in the paper")  # fmt: skip
@@ -161,7 +164,7 @@ def draw_panels(
     families = PANELS | {"Others": tuple(name for name in numbers if name not in in_some)}
     panels = {title: [name for name in names if name in numbers] for title, names in families.items()}
     panels = {title: names for title, names in panels.items() if names} or {"No feature": []}
-    fig = new_figure(13.2, 4.3)
+    fig = new_figure(max(13.2, 3.0 * len(panels)), 4.3)
     axes = fig.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     top = 1.06 * max(np.nanmax(part) for part in numbers.values())
     for ax, (family, names) in zip(axes, panels.items(), strict=True):

@@ -211,10 +211,10 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
                 held = [(reached < level).mean() for level in levels]
                 ax.plot(levels, held, style, color=PREDICTION_COLORS[color], label=WORDS[method])
         ax.plot([0, 1], [0, 1], ":", color=GREY)
-        grid(ax, xlabel=f"level of the {name} region", xlim=(0, 1), ylim=(0, 1))
+        grid(ax, xlabel=f"level of the {name} region", xlim=(-0.02, 1.02), ylim=(0, 1.02))
     axes[0].set_ylabel("share of pushes inside")
     if axes[1].get_legend_handles_labels()[0]:
-        axes[1].legend(loc="lower right")
+        fig.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     finish(fig, "Regions hold what they promise", "dotted: as promised")
     return fig
 

@@ -171,12 +171,17 @@ def paths_figure(
     lines = -(-len(rows) // columns)
     width, height = max(6.8, 3.4 * columns), 1.2 + 3.7 * lines
     fig = new_figure(width, height)
-    cells = fig.subplots(lines, columns, squeeze=False).ravel()
-    for ax, row in zip(cells, rows.to_dict("records"), strict=False):
-        paths = {name: np.array(path) / CM for name, path in _paths(row["paths_cm"]).items()}
+    cells = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    shown = [{name: np.array(path) / CM for name, path in _paths(text).items()} for text in rows["paths_cm"]]
+    window = window_of([path for paths in shown for path in paths.values()])
+    for k, (ax, paths, row) in enumerate(zip(cells, shown, rows.to_dict("records"), strict=False)):
         slip = row.get("slip_time", np.nan)
         slipped = "" if np.isnan(slip) else f", slips at {slip:.1f} s"
-        draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}")
+        draw_paths(ax, paths, f"{row['object']}, contact {row['contact']}{slipped}", window)
+        lowest = k + columns >= len(rows)
+        ax.set_xlabel(ax.get_xlabel() if lowest else "")
+        ax.set_ylabel("" if k % columns else ax.get_ylabel())
+        ax.tick_params(labelbottom=lowest)
     for ax in cells[len(rows) :]:
         ax.axis("off")
     handles = _handles((observed, "predicted", "simulated"))
@@ -199,21 +204,34 @@ def side_figure(
     """Observed and predicted centre of mass [m] of one recording from the side (paper, figure 14, last panel)."""
     fig = new_figure(6.4, 6.4)
     ax = fig.subplots()
-    draw_paths(ax, {"observed": observed, "predicted": predicted}, title)
+    paths = {"observed": observed, "predicted": predicted}
+    draw_paths(ax, paths, title, window_of(list(paths.values())))
     ax.legend(handles=_handles(("observed", "predicted")), loc="upper left")
     finish(fig, "Paths of the centre of mass from the side", "The table is grey")
     return fig
 
 
-def draw_paths(ax: Axes, paths: Mapping[str, Float[np.ndarray, "_ 3"]], title: str) -> None:
-    """Paths [m] by what they are, in the x-z plane of the action frame; scales in cm."""
+def window_of(paths: Sequence[Float[np.ndarray, "_ 3"]]) -> tuple[float, float, float]:
+    """Left and right end, and top, of what is shown around paths [m], in cm."""
+    seen = np.concatenate(paths)[:, [0, 2]] * CM
+    (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
+    half = max(PANEL, right - left + 2) / 2
+    middle = (left + right) / 2
+    return middle - half, middle + half, max(top + 1, PANEL - 1)
+
+
+def draw_paths(
+    ax: Axes,
+    paths: Mapping[str, Float[np.ndarray, "_ 3"]],
+    title: str,
+    window: tuple[float, float, float],
+) -> None:
+    """Paths [m] by what they are, in the x-z plane of the action frame, within a window; scales in cm."""
     for name, path in paths.items():
         draw_path(ax, path[:, [0, 2]] * CM, *PATHS[name])
     ax.set_title(title)
-    seen = np.concatenate(list(paths.values()))[:, [0, 2]] * CM
-    (left, _), (right, top) = seen.min(axis=0), seen.max(axis=0)
-    middle = (left + right) / 2
-    ax.set(xlim=(middle - PANEL / 2, middle + PANEL / 2), ylim=(-1, max(top + 1, PANEL - 1)))
+    left, right, top = window
+    ax.set(xlim=(left, right), ylim=(-1, top))
     ax.set(aspect="equal", xlabel="x, along the action [cm]", ylabel="z, up [cm]")
     draw_table(ax, 1.0)
     mesh(ax)

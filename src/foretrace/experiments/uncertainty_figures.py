@@ -83,7 +83,7 @@ def observed_figure(rows: pd.DataFrame) -> Figure:
     splits = list(dict.fromkeys(rows["split"]))
     groups = [name for name in MARKERS if name in set(rows.loc[rows["metric"].eq("record_rest"), "group"])]
     fig = new_figure(9.0, 0.9 + 3.2 * len(splits))
-    axes = fig.subplots(len(splits), len(BEGINNINGS), squeeze=False, sharex="col", sharey="row")
+    axes = fig.subplots(len(splits), len(BEGINNINGS), squeeze=False, sharex=True, sharey=True)
     for line, split in zip(axes, splits, strict=True):
         for ax, beginning in zip(line, BEGINNINGS, strict=True):
             mine = rows.loc[rows["split"].eq(split)]
