@@ -42,8 +42,9 @@ def act(visitor, rng: np.random.Generator) -> str:
             "draw",
             "save",
             "plan",
+            "photo",
         ],
-        p=[0.3, 0.08, 0.2, 0.08, 0.06, 0.06, 0.06, 0.03, 0.04, 0.05, 0.03, 0.01],
+        p=[0.3, 0.08, 0.19, 0.08, 0.06, 0.06, 0.06, 0.03, 0.04, 0.05, 0.03, 0.01, 0.01],
     )
     x, y = rng.uniform(-0.25, 0.25, 2).tolist()
     if kind in ("drag", "turn"):
@@ -54,7 +55,7 @@ def act(visitor, rng: np.random.Generator) -> str:
         visitor.set(chosen["label"], float(rng.uniform(chosen["min"], chosen["max"])))
     elif kind == "switch":
         visitor.set(
-            str(rng.choice(["play", "contact is", "90% region", "twin beside", "cost around"])),
+            str(rng.choice(["play", "contact is", "90% region", "twin beside", "cost around", "arm"])),
             bool(rng.integers(2)),
         )
     elif kind == "example":
@@ -71,6 +72,7 @@ def act(visitor, rng: np.random.Generator) -> str:
         visitor.click(str(rng.choice(["finish the outline", "cancel"])))
     else:
         buttons = {"simulate": "simulate it", "watch": "watch", "plan": "plan", "save": "picture (PNG)"}
+        buttons["photo"] = "example photograph"
         visitor.click(buttons[str(kind)])
     return str(kind)
 

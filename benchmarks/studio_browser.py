@@ -24,7 +24,9 @@ SHARES = {
     "button": 0.08, "write": 0.03, "click": 0.02,
 }  # fmt: skip
 """How often each action is taken."""
-SIZE = {"width": 1000, "height": 640}
+SIZE = {"width": 860, "height": 520}
+COARSE = 0.25
+"""Pixels that are drawn for each of the page's: without a graphics card, drawing takes most of the time."""
 PATIENCE = 3000
 """An element that cannot be used within this time is left alone [ms]."""
 KEYS = ("ArrowLeft", "ArrowRight", "Home", "End")
@@ -68,7 +70,7 @@ class Visit:
         if modifier:
             self.page.keyboard.down(modifier)
         mouse.down()
-        mouse.move(*end, steps=4)
+        mouse.move(*end, steps=2)
         mouse.up()
         if modifier:
             self.page.keyboard.up(modifier)
@@ -137,10 +139,11 @@ def visits(options: argparse.Namespace, faults: list[str]) -> dict[str, Any]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium(), args=list(SOFTWARE))
         for _ in range(options.visitors):
-            page = browser.new_page(viewport=SIZE)  # pyright: ignore[reportArgumentType]
+            page = browser.new_page(viewport=SIZE, device_scale_factor=COARSE)  # pyright: ignore
             page.on("pageerror", lambda error: faults.append(str(error)))
             page.goto(f"http://{server.address}")
             page.get_by_text("levered", exact=True).first.wait_for(timeout=120_000)
+            page.get_by_label("play").uncheck()  # until a visitor ticks it again
             visit = Visit(page, next(iter(server.pages.values())), rng)
             for kind in rng.choice(
                 list(SHARES), options.actions // options.visitors, p=list(SHARES.values())
