@@ -9,7 +9,7 @@ from rich.console import Console
 
 from foretrace.errors import DatasetError
 from foretrace.interactions import dataset as datasets
-from foretrace.interactions import index, storage
+from foretrace.interactions import index, parameters, storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect
@@ -109,3 +109,21 @@ def test_rows_without_a_checksum_are_read_again(folder, read):
     manifest["shards"][storage.shard_name(1)]["rows"] = 4
     Dataset.open(folder)
     assert set(read) == {storage.shard_name(0)}
+
+
+def test_parameters_are_kept_and_not_decoded_again(folder, monkeypatch):
+    small = storage.read_shard(folder, storage.shard_name(1))[0]
+    first = Dataset.open(folder, failed=True)
+
+    def refuse(*texts):
+        raise AssertionError(f"{texts} decoded again")
+
+    monkeypatch.setattr(parameters, "action_of", refuse)
+    second = Dataset.open(folder, failed=True)
+    assert second.parameters.keys() == {"insertion", "arc_radius", "sweep", "speed"}
+    for name, values in second.parameters.items():
+        np.testing.assert_array_equal(values, first.parameters[name])
+    assert len(second[4:8].where(insertion=0.022)) == len(small)
+    assert second[5].id == 5
+    monkeypatch.undo()
+    assert parameters.parameter_values(small)["sweep"].tolist() == second[4:8].parameters["sweep"].tolist()

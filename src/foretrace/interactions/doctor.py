@@ -14,6 +14,7 @@ from foretrace.errors import ActionError, DatasetError, ShapeError, shown
 from foretrace.files import partial_files, remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.dataset import count_outcomes
+from foretrace.interactions.parameters import parameter_values
 from foretrace.interactions.soundness import find_faults
 from foretrace.objects import object_from_json
 from foretrace.urls import Url, as_place, names_in
@@ -150,7 +151,7 @@ def _out_of_range(name: str, table: pa.Table, manifest: dict) -> Iterator[Findin
     drawn_columns = [f.name for f in table.schema if pa.types.is_floating(f.type) and f.name in ranges]
     columns = {column: table[column].to_numpy() for column in drawn_columns}
     try:
-        columns |= storage.parameter_values(table)
+        columns |= parameter_values(table)
         nominal = ToolPath(**manifest["configuration"].get("path", {})).parameters()["speed"]
     except (ActionError, TypeError):
         return

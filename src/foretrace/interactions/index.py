@@ -15,11 +15,12 @@ from jaxtyping import Int
 from foretrace.errors import DatasetError
 from foretrace.files import atomic_path, cache_folder, make_folder, short_hash
 from foretrace.interactions import storage
+from foretrace.interactions.parameters import PARAMETER, with_parameters
 from foretrace.urls import Url, names_in, read_each
 
 INDEX = "index.arrow"
 """File of the columns; it is made again wherever it is missing or does not fit."""
-SHARDS = b"foretrace-shards"
+SHARDS = b"foretrace-shards-with-parameters"
 """Entry of its metadata with name, checksum and rows of each shard that it covers, in its order."""
 
 Entries = Sequence[tuple[str, storage.ShardEntry]]
@@ -28,7 +29,9 @@ Entries = Sequence[tuple[str, storage.ShardEntry]]
 def kept_index(
     folder: Path | Url, entries: Entries, read: Callable[[int], pa.Table], columns: Sequence[str]
 ) -> tuple[pa.Table, list[int]]:
-    """Some columns of all shards, and the number of rows of each; only shards that are not in the file are read.
+    """Some columns of all shards, with parameters of the actions, and the number of rows of each.
+
+    Only shards that are not in the file are read.
 
     Args:
         folder: The data set's folder, or its URL.
@@ -52,12 +55,12 @@ def kept_index(
         key = entries[number][0], entries[number][1].get("sha256")
         if kept is not None and key in covered and key[1] is not None:
             return kept.slice(starts[key], covered[key])
-        return read(number)
+        return with_parameters(read(number))
 
     tables = read_each(table_of, range(len(entries)), folder)
     keys = ((name, entry.get("sha256")) for name, entry in entries)
     rows = {key: table.num_rows for key, table in zip(keys, tables, strict=True)}
-    index = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
+    index = pa.concat_tables(tables, promote_options="default").unify_dictionaries().combine_chunks()
     about = json.dumps([[*key, count] for key, count in rows.items()]).encode()
     with suppress(OSError):  # a folder that cannot be written to is read each time
         _write(home, index.replace_schema_metadata({SHARDS: about}))
@@ -87,7 +90,8 @@ def _read(folder: Path, columns: Sequence[str]) -> tuple[pa.Table | None, dict[t
         table = file.read_all()
         table.validate(full=True)  # since nothing else looks at offsets before they are used
         covered = {(name, sum): rows for name, sum, rows in json.loads(table.schema.metadata[SHARDS])}
-        if table.column_names == list(columns) and sum(covered.values()) == table.num_rows:
+        names = [name for name in table.column_names if not name.startswith(PARAMETER)]
+        if names == list(columns) and sum(covered.values()) == table.num_rows:
             return table.replace_schema_metadata(None), covered
     return None, {}
 

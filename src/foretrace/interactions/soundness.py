@@ -11,6 +11,7 @@ from foretrace.actions import FAILED
 from foretrace.actions.base import UNIT_TOLERANCE
 from foretrace.errors import ActionError, DatasetError, shown
 from foretrace.interactions import storage
+from foretrace.interactions.parameters import action_of
 from foretrace.interactions.topdown import VIEW_SIZE
 from foretrace.schema import conform, parse_json
 
@@ -147,12 +148,8 @@ def _of_actions(table: pa.Table, numbers: np.ndarray) -> Iterator[tuple[int, str
             yield int(numbers[row]), f"it has the unknown outcome {shown(outcome)}"
 
 
-# Of a data set's texts, few differ from shard to shard.
-@lru_cache(maxsize=1024)
 def _outcomes_of(action: str, path: str, tool: str) -> tuple[str, ...]:
-    place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
-    decoded = storage.decode_action({"action": action, "path": path, "tool": tool, **place})
-    return (*decoded.outcomes, FAILED)
+    return (*action_of(action, path, tool).outcomes, FAILED)
 
 
 @lru_cache(maxsize=64)

@@ -218,23 +218,6 @@ def decode_action(row: Mapping[str, Any]) -> Action:
     return Action.from_dict({"label": row["action"], **place, **settings})
 
 
-def parameter_values(table: pa.Table) -> dict[str, np.ndarray]:
-    """Parameters of the actions in a table by name [SI], one number a row; NaN where an action lacks one."""
-    kinds = list(zip(*(table[name].to_pylist() for name in ("action", "path", "tool")), strict=True))
-    place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
-    numbers = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
-    found = [
-        decode_action({"action": action, "path": path, "tool": tool, **place}).parameters()
-        for action, path, tool in numbers
-    ]
-    rows = [numbers[kind] for kind in kinds]
-    names = dict.fromkeys(name for parameters in found for name in parameters)
-    return {
-        name: np.array([parameters.get(name, np.nan) for parameters in found], dtype=float)[rows]
-        for name in names
-    }
-
-
 def unpack_masks(packed: Sequence[bytes]) -> np.ndarray:
     """(n, 128, 128) masks from their stored form."""
     bits = np.frombuffer(b"".join(packed), dtype=np.uint8)

@@ -11,6 +11,7 @@ from foretrace.actions import action_transform
 from foretrace.errors import DatasetError
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch, outcome_array, padded
+from foretrace.interactions.parameters import parameter_values
 from foretrace.objects import ObjectModel, Weighted
 
 
@@ -59,7 +60,7 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
         slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
         support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
         outcome=outcome_array(table["outcome"].to_pylist()),
-        parameters=constants | storage.parameter_values(table),
+        parameters=constants | parameter_values(table),
     )
 
 

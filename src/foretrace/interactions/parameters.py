@@ -1,0 +1,48 @@
+"""Parameters of the actions in a table, which are decoded from texts once."""
+
+from functools import lru_cache
+
+import numpy as np
+import pyarrow as pa
+
+from foretrace.actions import Action
+from foretrace.interactions import storage
+
+PARAMETER = "parameter "
+"""Beginning of the names of columns with a parameter of the actions each."""
+
+
+# The same rows are checked and then asked for their parameters, and the texts of many rows are the same.
+@lru_cache(maxsize=1024)
+def action_of(action: str, path: str, tool: str) -> Action:
+    """The action of that label, with that path and tool, at the origin along x."""
+    place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
+    return storage.decode_action({"action": action, "path": path, "tool": tool, **place})
+
+
+def parameter_values(table: pa.Table) -> dict[str, np.ndarray]:
+    """Parameters of the actions in a table by name [SI], one number a row; NaN where an action lacks one."""
+    kinds = list(zip(*(table[name].to_pylist() for name in ("action", "path", "tool")), strict=True))
+    numbers = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
+    found = [action_of(*kind).parameters() for kind in numbers]
+    rows = [numbers[kind] for kind in kinds]
+    names = dict.fromkeys(name for parameters in found for name in parameters)
+    return {
+        name: np.array([parameters.get(name, np.nan) for parameters in found], dtype=float)[rows]
+        for name in names
+    }
+
+
+def with_parameters(table: pa.Table) -> pa.Table:
+    """A table with a column for each parameter of its actions."""
+    for name, values in parameter_values(table).items():
+        table = table.append_column(PARAMETER + name, pa.array(values, pa.float64()))
+    return table
+
+
+def parameters_in(index: pa.Table) -> dict[str, np.ndarray]:
+    """Parameters of the actions by name [SI], one number a row; NaN where an action lacks one."""
+    names = [name for name in index.column_names if name.startswith(PARAMETER)]
+    if not names:
+        return parameter_values(index)
+    return {name.removeprefix(PARAMETER): index[name].to_numpy().astype(float, copy=False) for name in names}
