@@ -280,7 +280,7 @@ class Action(ABC):
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> "Action":
-        """The action that `to_dict` described, with the same bits.
+        """The action that `to_dict` described, with the same bits; its tool may be there already.
 
         Raises:
             ActionError: There is no such action, or an entry is missing or impossible.
@@ -289,7 +289,8 @@ class Action(ABC):
         kind = ACTIONS.find(content.get("label"))
         try:
             path = _kinds(kind)["path"](**content["path"])
-            action = kind(content["contact"], content["direction"], path, Tool.from_dict(content["tool"]))
+            tool = content["tool"] if isinstance(content["tool"], Tool) else Tool.from_dict(content["tool"])
+            action = kind(content["contact"], content["direction"], path, tool)
             direction = np.array(
                 content["direction"], dtype=float
             )  # finite, and of a length, or refused above

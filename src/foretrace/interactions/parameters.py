@@ -5,8 +5,8 @@ from functools import lru_cache
 import numpy as np
 import pyarrow as pa
 
-from foretrace.actions import Action
-from foretrace.interactions import storage
+from foretrace.actions import Action, Tool
+from foretrace.schema import parse_json
 
 PARAMETER = "parameter "
 """Beginning of the names of columns with a parameter of the actions each."""
@@ -17,7 +17,12 @@ PARAMETER = "parameter "
 def action_of(action: str, path: str, tool: str) -> Action:
     """The action of that label, with that path and tool, at the origin along x."""
     place = {"contact": (0.0, 0.0), "direction": (1.0, 0.0)}
-    return storage.decode_action({"action": action, "path": path, "tool": tool, **place})
+    return Action.from_dict({"label": action, "path": parse_json(path), "tool": _tool_of(tool), **place})
+
+
+@lru_cache(maxsize=64)
+def _tool_of(text: str) -> Tool:
+    return Tool.from_dict(parse_json(text))
 
 
 def parameter_values(table: pa.Table) -> dict[str, np.ndarray]:
