@@ -95,7 +95,7 @@ class Loopback:
             self._start("node", f"--address={self.address}")
 
     def _start(self, node: str, options: str) -> None:
-        words = ["ray", "start", *NODE.split(), *options.split()]
+        words = [*self.within(node), "ray", "start", *NODE.split(), *options.split()]
         mark = {MARK: f"{self.name}-{node}"}
         for _ in range(3):
             done = subprocess.run(
@@ -106,6 +106,10 @@ class Loopback:
             self.kill(node)
             time.sleep(2)
         raise SystemExit(f"{' '.join(words)}: {done.stdout[-500:]}{done.stderr[-500:]}")
+
+    def within(self, node: str) -> list[str]:
+        """What begins the commands of a node."""
+        return []
 
     def processes(self, node: str, beginning: str = "") -> Iterator[int]:
         """Numbers of a node's processes whose command begins so."""
