@@ -60,6 +60,7 @@ def main() -> None:
         if options.photo:
             page.get_by_role("tab", name="Object").click()
             page.get_by_text("Photograph", exact=True).click(timeout=120_000)
+            page.get_by_text("find the object").wait_for(timeout=120_000)
             page.wait_for_timeout(5_000)
         page.screenshot(path=options.out, timeout=120_000)
         browser.close()
