@@ -8,13 +8,13 @@ import torch
 from safetensors.torch import load_file
 
 from factories import fake_batch
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, Push, ToolPath
 from foretrace.cli import main
 from foretrace.cli.prediction import _given_context
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
 from foretrace.imagined import LEVELS
-from foretrace.imagined.context import PARAMETERS, nominal_parameters, true_context
+from foretrace.imagined.context import context_units, nominal_parameters, true_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
@@ -213,7 +213,10 @@ def test_options_of_predict_are_checked(given, knows, simulated, message):
 
 
 def test_the_actions_parameters_are_context_as_constants_are(batch):
-    assert set(PARAMETERS) == set(LeverUp.nominal_parameters())
+    units = context_units()
+    assert {*LeverUp.nominal_parameters(), *Push.nominal_parameters()} <= set(units)
+    assert units["speed"] == "as a multiple of the nominal one (lever-up), in m/s (push)"
+    assert units["distance"] == "in m"
     rng = np.random.default_rng(3)
     sweep = rng.uniform(0.4, 1.0, 40)
     rest = batch.com[:, :1]

@@ -2,10 +2,12 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import foretrace as ft
 from factories import write_push_table
@@ -19,10 +21,15 @@ from foretrace.errors import (
     ResultsError,
     ShapeError,
 )
+from foretrace.experiments import pushes_views
 from foretrace.experiments.pushes import repetitions, split_pushes
+from foretrace.experiments.pushes_views import OUTCOMES, VIEWED, answer_from_views
+from foretrace.features.action_frame import PROBES, RAYS, find_action_frame
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.pushes import read_pushes
+from foretrace.interactions.splits import split_by_seed
 from foretrace.objects import FOOTINGS, NO_BEVEL, Footed, HullShape, Prism, object_from_dict
+from foretrace.predictor import TrainConfig, fit_predictor
 from foretrace.simulation.sliding import Footprint, slide
 from foretrace.twin import sliding
 from foretrace.twin.sliding import Change, SlidingTwin
@@ -370,10 +377,56 @@ def test_options_of_a_lever_ups_path_are_refused_for_pushes(tmp_path, capsys):
         "--contacts-per-edge",
         "1",
     ]
-    refused = {
-        "insertion = 0.03 is of a lever-up's path, and recipe 'pushes' has a push": ["--insertion", "0.03"],
-        "the path of a push cannot be varied, only a lever-up's: leave --vary-action out": ["--vary-action"],
-    }
-    for number, (told, options) in enumerate(refused.items()):
-        assert main([*command, "--workers", "1", "--out", str(tmp_path / str(number)), *options]) == 2
-        assert told in capsys.readouterr().err
+    assert main([*command, "--workers", "1", "--out", str(tmp_path / "out"), "--insertion", "0.03"]) == 2
+    told = "insertion = 0.03 is of a lever-up's path, and recipe 'pushes' has a push"
+    assert told in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A data set of pushes that are known at their ends alone."""
+    folder = tmp_path_factory.mktemp("recorded")
+    table, shapes = write_push_table(folder, 40)
+    assert main(["import", "pushes", str(table), "--shapes", str(shapes), "--out", str(folder / "data")]) == 0
+    return ft.Dataset.open(folder / "data").batch()
+
+
+@pytest.mark.parametrize("name", sorted(VIEWED))
+def test_predictors_learn_from_pushes_that_are_known_at_their_ends(recorded, name):
+    split = split_by_seed(len(recorded), 0, None)
+    training = TrainConfig(epochs=3, min_steps=1, outcomes=OUTCOMES, split=None)
+    predictor, _ = fit_predictor(recorded, VIEWED[name], split, training)
+    assert predictor.action is ft.Push
+    imagined = predictor.imagine_batch(recorded)
+    assert imagined.com.shape == (len(recorded), 2, 3)
+    mirrored = predictor.imagine_batch(recorded.mirrored())
+    np.testing.assert_allclose(mirrored.com, imagined.com * [1, -1, 1], atol=2e-6)
+    twice = recorded.parameters | {"distance": 2 * recorded.parameters["distance"]}
+    farther = predictor.imagine_batch(replace(recorded, parameters=twice))
+    assert np.abs(farther.com - imagined.com).max() > 1e-5
+    view = ft.TopDownView.of(PLATE, ft.Push.at_edge(PLATE, 1))
+    slow = ft.Push.at_edge(PLATE, 1, path=ft.PushPath(distance=0.03))
+    assert predictor.imagine(view, slow).com_trajectory.shape == (2, 3)
+
+
+def test_an_object_relative_to_an_action():
+    corners = torch.tensor(np.add(SQUARE, [SIDE / 2, 0.01]))[None].float()
+    corners = torch.cat([corners, corners[:, :1]], dim=1)  # the first corner fills the row
+    values = find_action_frame(corners, torch.tensor([[SIDE / 2, 0.01, 0.0065]])).values
+    com, radii, front = values[0, 0, 0].split([3, RAYS, PROBES])
+    np.testing.assert_allclose(com, [0.45, 0.1, 0.065], atol=1e-6)
+    angles = 2 * np.pi * np.arange(RAYS) / RAYS
+    expected = SIDE / 2 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    np.testing.assert_allclose(radii, 10 * expected, atol=1e-5)
+    np.testing.assert_allclose(front, 0.0, atol=1e-6)  # its side is straight and across the path
+
+
+def test_views_answer_for_recorded_pushes(tmp_path, monkeypatch):
+    monkeypatch.setattr(pushes_views, "EPOCHS", 8)
+    pushes = read_pushes(*write_push_table(tmp_path, 100))[0]
+    config = replace(VIEWED["one-shot"], ensemble=1)
+    found, regions, scale = answer_from_views(config, pushes[:60], pushes[60:], 0)
+    errors = push_errors(found, pushes[60:].displacement())
+    stays = push_errors(np.zeros_like(found), pushes[60:].displacement())
+    assert (errors.mean(axis=0) < 0.5 * stays.mean(axis=0)).all()
+    assert regions.radius(0.5, scale).shape == errors.shape

@@ -8,7 +8,7 @@ from rich.console import Console
 
 import factories
 from engines_at_hand import WITHOUT_BULLET
-from foretrace.actions import LeverUp, ToolPath
+from foretrace.actions import LeverUp, PushPath, ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.cli import main
 from foretrace.errors import ActionError, DatasetError, ShapeError, SimulationError
@@ -35,6 +35,7 @@ TOOL = SimulationConfig(embodiment="tool")
 PLAIN = CollectConfig(objects=8, simulation=TOOL)
 VARIED = replace(PLAIN, randomisation=RANDOMISED)
 EVERYTHING = replace(RANDOMISED, **VARIED_ACTION)
+DRAWN = [name for name in RANGES if name != "distance"]  # of lever-ups
 PENTAGON = Prism([[0.1, 0.0], [0.02, 0.09], [-0.08, 0.05], [-0.07, -0.06], [0.04, -0.09]])
 
 
@@ -75,9 +76,9 @@ def varied(tmp_path_factory):
 
 def test_draws_fill_their_ranges_and_stay_within():
     every = [drawn(EVERYTHING, seed) for seed in range(300)]
-    limits = {name: getattr(EVERYTHING, name) for name in RANGES}
+    limits = {name: getattr(EVERYTHING, name) for name in DRAWN}
     limits |= {name: (-getattr(RANDOMISED, name), getattr(RANDOMISED, name)) for name in LARGEST}
-    others = {"com_offset", "execution_share"}
+    others = {"com_offset", "execution_share", "distance"}
     assert limits.keys() | others == {field.name for field in fields(Randomisation)}
     values = {name: np.array([each[name] for each in every]) for name in limits}
     for name, (low, high) in limits.items():
@@ -88,7 +89,7 @@ def test_draws_fill_their_ranges_and_stay_within():
     assert np.abs(correlations).max() < 0.25
 
 
-@pytest.mark.parametrize("name", [*RANGES, *LARGEST])
+@pytest.mark.parametrize("name", [*DRAWN, *LARGEST])
 def test_what_is_drawn_for_one_quantity_does_not_depend_on_the_others(name):
     alone = Randomisation(**{name: getattr(EVERYTHING, name)})
     expected = drawn(NOTHING, 5) | {name: drawn(EVERYTHING, 5)[name]}
@@ -102,6 +103,20 @@ def test_what_was_drawn_before_the_action_varied_is_drawn_still():
     assert numbers["friction"] == 0.5 + shares[0] * (1.1 - 0.5)
     assert numbers["execution_turn"] == np.deg2rad(3.0) * (2 * shares[8] - 1)
     assert numbers.items() >= LeverUp.nominal_parameters().items()
+
+
+def test_long_and_short_pushes_end_at_the_same_time():
+    drawn = Randomisation(distance=(0.01, 0.08))
+    paths = [
+        drawn.vary(PENTAGON, Physics(), PushPath(), np.random.default_rng(seed))[2] for seed in range(100)
+    ]
+    distances = [path.distance for path in paths]
+    assert min(distances) < 0.015
+    assert max(distances) > 0.075
+    for path in paths:
+        assert path.duration == pytest.approx(PushPath(distance=0.08).duration)
+    with pytest.raises(SimulationError, match="insertion cannot be drawn of a PushPath"):
+        replace(drawn, insertion=(0.01, 0.02)).vary(PENTAGON, Physics(), PushPath(), np.random.default_rng(0))
 
 
 def test_fast_and_slow_blades_end_at_the_same_time():

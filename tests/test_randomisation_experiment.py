@@ -24,7 +24,6 @@ from foretrace.experiments.randomisation_figures import BARS, KNOWING, NOMINAL, 
 from foretrace.experiments.training import Recipe
 from foretrace.experiments.transfer_objects import Subject
 from foretrace.imagined import Futures, ImaginedBatch
-from foretrace.imagined.context import PARAMETERS
 from foretrace.objects.everyday import PENTAGON
 from foretrace.predictor import LstmConfig
 from foretrace.simulation.randomisation import RANDOMISED, Randomisation
@@ -183,13 +182,13 @@ def test_actions_that_vary_are_context_without_a_stand_in(folders, tmp_path, mon
         return measure(predictor, batch, inputs)
 
     monkeypatch.setattr(randomisation, "measure_errors", spy)
-    options = {"features": ("none",), "seeds": (0,), "repeats": 0, "context": tuple(PARAMETERS)}
+    options = {"features": ("none",), "seeds": (0,), "repeats": 0, "context": tuple(LeverUp.units)}
     varied = compared((plain, action), **options)
     found = run_experiment(varied, tmp_path, console=QUIET)
     table = found.rows
     assert not table["metric"].str.contains("stand_in").any()
     assert table.groupby("setting")["metric"].nunique().to_dict() == {PLAIN: 6, VARIED: 6, KNOWING: 8}
-    assert {context for context, _ in told} == {tuple(PARAMETERS)}
+    assert {context for context, _ in told} == {tuple(LeverUp.units)}
     spreads = [np.ptp(batch.parameters["sweep"]) > 0.1 for _, batch in told]
     assert spreads == [False, False, True, False]  # plain, with nominal values, varied, with nominal values
     assert set(told[3][1].parameters["sweep"]) == {ToolPath.sweep}

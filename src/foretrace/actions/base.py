@@ -56,6 +56,8 @@ class Action(ABC):
     """Free space that the tool takes before a contact: half its width, its nearest and its farthest end [m]."""
     cone: ClassVar[float] = 0.2
     """Largest angle between direction and inward normal that a planner tries by default [rad]."""
+    units: ClassVar[Mapping[str, str]] = {}
+    """Units of the path's parameters, in words: ``in m``. One that is not here is in SI units."""
     varied: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Parameters of the path that a planner may vary, with their ranges [SI]."""
     path_matters: ClassVar[bool] = False

@@ -1,6 +1,7 @@
 """The lever-up action: a blade is pushed under the object and lifts it (paper, section 4)."""
 
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,14 @@ class LeverUp(Action):
     label = "lever-up"
     outcomes = tuple(str(outcome) for outcome in Outcome if outcome != FAILED)
     approach = APPROACH
+    units = MappingProxyType(
+        {
+            "insertion": "in m",
+            "arc_radius": "in m",
+            "sweep": "in rad",
+            "speed": "as a multiple of the nominal one",
+        }
+    )
     varied = VARIED_ACTION
     sets_down = True
     path: ToolPath = ToolPath()

@@ -125,6 +125,7 @@ class Push(Action):
     outcomes = tuple(str(outcome) for outcome in PushOutcome if outcome != FAILED)
     approach = (ROD.radius, PushPath.approach, PushPath.approach + 2 * ROD.radius)
     cone = 0.7
+    units = MappingProxyType({"distance": "in m", "speed": "in m/s", "approach": "in m"})
     varied = MappingProxyType({"distance": (0.002, 0.1)})
     path_matters = True
     path: PushPath = PushPath()
@@ -178,11 +179,9 @@ class Push(Action):
 
     def parameters(self) -> dict[str, float]:
         """``distance`` [m], ``speed`` [m/s] and ``approach`` [m] of the path."""
-        return {name: value for name, value in asdict(self.path).items() if name in PARAMETERS}
+        return {name: value for name, value in asdict(self.path).items() if name in self.units}
 
 
-PARAMETERS = ("distance", "speed", "approach")
-"""Parameters of a push that predictors can be conditioned on."""
 AHEAD = 0.005
 """The middle of a pushed object lies at least this far ahead of a sampled contact [m]."""
 BEHIND, BESIDE = 0.085, 0.19

@@ -15,7 +15,7 @@ from foretrace.errors import ForetraceError, PredictionError
 from foretrace.imagined.shown import LEVEL
 
 if TYPE_CHECKING:
-    from foretrace.actions import Action, ToolPath
+    from foretrace.actions import Action
     from foretrace.imagined import ImaginedBatch, Imaginer
     from foretrace.interactions.topdown import TopDownView
 
@@ -59,7 +59,7 @@ def predict_many(
     at: ContactOptions,
     many: ManyOptions,
     told: Mapping[str, float],
-    path: "ToolPath",
+    path: Any,
     out: Path,
 ) -> None:
     """Predict every object at every contact, and write a table.
@@ -70,7 +70,7 @@ def predict_many(
         at: The contact, where the options give none.
         many: Objects and contacts.
         told: Context.
-        path: The blade's path.
+        path: The tool's path.
         out: Folder of the table.
 
     Raises:
@@ -125,7 +125,7 @@ def _predict(
     at: ContactOptions,
     contacts: int | None,
     told: Mapping[str, float],
-    path: "ToolPath",
+    path: Any,
 ) -> list[Row]:
     """The rows of one object."""
     from foretrace.planning.candidates import Scene
@@ -133,7 +133,9 @@ def _predict(
     obj, mask = given.load()
     scene = Scene.of(obj)
     view = scene.view if mask is None else _view_of(mask, given, scene)
-    actions = [at.place(obj)] if contacts is None else _around(scene, contacts)
+    actions = (
+        [at.place(obj, predictor.action)] if contacts is None else _around(scene, predictor.action, contacts)
+    )
     actions = [replace(action, path=path) for action in actions]
     imagined = predictor.imagine_candidates(
         view, scene.in_view(actions), context=dict(told), com=scene.com_in_view if mask is None else None
@@ -149,18 +151,17 @@ def _view_of(mask: np.ndarray, given: ObjectOptions, scene: Any) -> "TopDownView
     return TopDownView.from_mask(mask, given.scale or 1.0, -turn.T @ shift, turn[0], scene.height)
 
 
-def _around(scene: Any, number: int) -> "list[Action]":
-    """Lever-ups along the inward normals at evenly spaced points of the outline that a blade gets to.
+def _around(scene: Any, kind: "type[Action]", number: int) -> "list[Action]":
+    """Actions along the inward normals at evenly spaced points of the outline that the tool gets to.
 
     Raises:
         PredictionError: There is none.
     """
-    from foretrace.actions import LeverUp, ToolPath
     from foretrace.planning.candidates import Rim, find_free, place
 
     rim = Rim(scene.outline)
     along = (np.arange(number) + 0.5) * rim.length / number
-    found = place(LeverUp, rim, along, np.zeros(number), [ToolPath()] * number)
+    found = place(kind, rim, along, np.zeros(number), [kind.path_of()] * number)
     free, lost = find_free(scene, found)
     if not free.any():
         raise PredictionError(f"no contact can be used ({', '.join(lost)}): give --edge or --contact")

@@ -1,8 +1,8 @@
-"""Options that say where an object is levered."""
+"""Options that say where a tool meets an object."""
 
 from dataclasses import dataclass
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action, LeverUp
 from foretrace.errors import PredictionError
 from foretrace.objects import ObjectModel
 
@@ -30,8 +30,8 @@ class ContactOptions:
             raise PredictionError("--fraction goes with --edge: give one, or leave it out")
         return None if self.edge is None else (self.edge, 0.5 if self.fraction is None else self.fraction)
 
-    def place(self, obj: ObjectModel) -> LeverUp:
-        """The lever-up of an object.
+    def place(self, obj: ObjectModel, kind: type[Action] = LeverUp) -> Action:
+        """The action on an object, by default a lever-up.
 
         Raises:
             PredictionError: Options do not go together.
@@ -40,6 +40,6 @@ class ContactOptions:
         if (self.edge is None) == (self.contact is None):
             raise PredictionError("give either --edge (with --fraction) or --contact X Y")
         if self.share is not None:
-            return LeverUp.at_edge(obj, *self.share)
+            return kind.at_edge(obj, *self.share)
         assert self.contact is not None
-        return LeverUp.nearest(obj, self.contact)
+        return kind.nearest(obj, self.contact)

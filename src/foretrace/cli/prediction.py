@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from foretrace.actions import ToolPath
 from foretrace.cli.batch import ManyOptions, predict_many
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.example import say_example, write_example
@@ -17,28 +16,28 @@ from foretrace.cli.futures import say_futures
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
-from foretrace.imagined.context import CONSTANTS, CONTEXT, EXACT, PARAMETERS, nominal_constants
+from foretrace.imagined.context import CONSTANTS, EXACT, context_units, nominal_constants
 from foretrace.imagined.shown import LEVEL, radius_of
 from foretrace.perception.example import EXAMPLE
 from foretrace.perception.photo import PhotoConfig
 
 if TYPE_CHECKING:
-    from foretrace.actions import LeverUp
+    from foretrace.actions import Action
     from foretrace.imagined import ImaginedEffect
     from foretrace.interactions.record import Interaction
     from foretrace.interactions.topdown import TopDownView
     from foretrace.objects import ObjectModel
 
 
-def _named(name: str) -> str:
-    return f"{name.replace('_', ' ').capitalize()} {CONTEXT[name]}."
+def _named(name: str, unit: str) -> str:
+    return f"{name.replace('_', ' ').capitalize()} {unit}."
 
 
 ContextOptions = make_dataclass(
     "ContextOptions",
     [
-        (name, float | None, field(default=None, metadata={"help": f"{_named(name)}"}))
-        for name in CONTEXT
+        (name, float | None, field(default=None, metadata={"help": _named(name, unit)}))
+        for name, unit in context_units().items()
         if name != EXACT
     ],
     frozen=True,
@@ -93,7 +92,10 @@ def predict(
     predictor = load_imaginer(run)
     values = _given_context(asdict(context), predictor.context, compare)
     told = _told(values, predictor.context, unknown)
-    path = ToolPath.of(**{name: value for name, value in values.items() if name in PARAMETERS})
+    kind = predictor.action
+    path = kind.path_of(
+        **{name: value for name, value in values.items() if name in kind.nominal_parameters()}
+    )
     if _changed(many):
         if idle := [*photo.given(), *["--compare"] * compare]:
             raise PredictionError(f"--images and --contacts go without {', '.join(idle)}: leave it out")
@@ -108,7 +110,7 @@ def predict(
     else:
         if idle := photo.given():
             raise PredictionError(f"{', '.join(idle)} goes with --photo: give one, or leave it out")
-        object, action, view, com = _object_and_action(obj, at)
+        object, action, view, com = _object_and_action(obj, at, kind)
     action = replace(action, path=path)
     imagined = predictor.imagine(view, action, context=told, com=com)
     truth = _simulate(object, action, values) if compare else None
@@ -130,7 +132,7 @@ def predict(
 def _draw(
     out: Path,
     obj: "ObjectModel",
-    action: "LeverUp",
+    action: "Action",
     imagined: "ImaginedEffect",
     name: str,
     truth: "Interaction | None",
@@ -169,14 +171,14 @@ def _changed(options: Any) -> list[str]:
 
 
 def _object_and_action(
-    given: ObjectOptions, at: ContactOptions
-) -> "tuple[ObjectModel, LeverUp, TopDownView, np.ndarray | None]":
+    given: ObjectOptions, at: ContactOptions, kind: "type[Action]"
+) -> "tuple[ObjectModel, Action, TopDownView, np.ndarray | None]":
     """Object, action, view, and the centre of mass in the action frame where the geometry determines it."""
     from foretrace.geometry import transform_points
     from foretrace.interactions.topdown import TopDownView
 
     obj, mask = given.load()
-    action = at.place(obj)
+    action = at.place(obj, kind)
     if mask is not None:
         frame = (action.contact, action.direction)
         return obj, action, TopDownView.from_mask(mask, given.scale, *frame, obj.height), None  # pyright: ignore
@@ -209,7 +211,7 @@ def _told(given: dict[str, float], context: tuple[str, ...], unknown: bool) -> d
     return usual | {name: value for name, value in given.items() if name in context}
 
 
-def _simulate(obj: "ObjectModel", action: "LeverUp", given: dict[str, float]) -> "Interaction":
+def _simulate(obj: "ObjectModel", action: "Action", given: dict[str, float]) -> "Interaction":
     from foretrace.interactions.record import Physics
     from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
@@ -221,7 +223,7 @@ def _write_trajectory(
     out: Path,
     run: Path | None,
     obj: "ObjectModel",
-    action: "LeverUp",
+    action: "Action",
     imagined: "ImaginedEffect",
     truth: "Interaction | None",
 ) -> None:

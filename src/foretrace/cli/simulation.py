@@ -6,11 +6,10 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.cli.parsing import adapt
 from foretrace.errors import DatasetError
-from foretrace.simulation.collect import CollectConfig, collect
+from foretrace.simulation.collect import CollectConfig, collect, trial
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED
 from foretrace.urls import as_place
@@ -44,7 +43,7 @@ def simulate(
             prisms, and 1.5 otherwise, since solids may roll.
         randomise: Draw friction, density, thickness and bevel anew for every lever-up, and offset the blade in place
             and direction. Objects and commanded contacts stay the same.
-        vary_action: Draw insertion, arc and speed of the blade anew for every lever-up.
+        vary_action: Draw insertion, arc and speed of the blade anew for every lever-up, or the distance of every push.
         exact_share: Share of the lever-ups whose contact is as commanded, with --randomise.
         off_centre: Move the centre of mass of half the prisms and boxes away from the middle.
         workers: Number of processes; by default one for each core.
@@ -55,7 +54,7 @@ def simulate(
         watch_time = 0.0 if config.recipe == "paper" else ROLLING_TIME
     randomisation = RANDOMISED if randomise else NOTHING
     if vary_action:
-        randomisation = replace(randomisation, **VARIED_ACTION)
+        randomisation = replace(randomisation, **type(trial(config, 0)[1]).varied)
     if exact_share:
         randomisation = replace(randomisation, execution_share=1 - exact_share)
     if off_centre:

@@ -6,7 +6,7 @@ predicts the object's pose after the push from its pose before it and from the r
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from foretrace.experiments.pushes_report import (
     summary_of,
     worst_of,
 )
+from foretrace.experiments.pushes_views import VIEWED, answer_from_views
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix, rotate_plane
 from foretrace.interactions.pushes import ROD_RADIUS, RecordedPushes, read_pushes
@@ -102,7 +103,7 @@ class PushesExperiment(Experiment):
     """Leave out rows that are wrong, and list them."""
     methods: tuple[str, ...] = ()
     """Methods that are compared: stays, constant, nearest, simulation, mujoco, identified-20, identified, learned,
-    residual, and models whose predictions are in the table; by default all."""
+    im-cnn, one-shot, residual, and models whose predictions are in the table; by default all."""
 
     label = "pushes"
     summary = SUMMARIES["pushes"]
@@ -349,6 +350,11 @@ def _fitted(model: PushResidual, task: Task) -> Answer:
     return Answer(found, model.regions, scale)
 
 
+def _viewed(name: str, task: Task) -> Answer:
+    """A predictor that observes a view."""
+    return Answer(*answer_from_views(VIEWED[name], task.learn, task.test, task.seed))
+
+
 METHODS: dict[str, Callable[[Task], Answer]] = {
     "stays": _stays,
     "constant": _constant,
@@ -358,6 +364,7 @@ METHODS: dict[str, Callable[[Task], Answer]] = {
     f"identified-{FEW}": _identified_from_few,
     "identified": _identified,
     "learned": _learned,
+    **{name: partial(_viewed, name) for name in VIEWED},
     "residual": _residual,
 }
 """Every method beside those whose predictions are in the table."""

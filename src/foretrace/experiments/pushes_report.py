@@ -26,6 +26,8 @@ WORDS = {
     "identified-20": "twin, constants from 20 pushes",
     "identified": "twin, constants from all pushes",
     "learned": "learned alone",
+    "im-cnn": "im-cnn + LSTM",
+    "one-shot": "one-shot",
     "residual": "residual over the twin",
 }
 """Methods in words."""

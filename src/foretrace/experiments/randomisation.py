@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tyro.conf import Fixed, Suppress
 
+from foretrace.actions import LeverUp
 from foretrace.errors import ResultsError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds
 from foretrace.evaluation.metrics import measure_errors
@@ -43,7 +44,7 @@ from foretrace.experiments.training import BASE, Recipe, load_levered
 from foretrace.experiments.transfer import distance_until_slip
 from foretrace.experiments.transfer_objects import Subject, everyday_objects, play, printed_shapes
 from foretrace.features import FEATURES
-from foretrace.imagined.context import CONSTANTS, CONTEXT, EXACT, check_names, column_of, true_context
+from foretrace.imagined.context import CONSTANTS, EXACT, check_names, column_of, true_context
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
@@ -51,6 +52,8 @@ from foretrace.predictor import EffectPredictor
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 
+CONTEXT = (*CONSTANTS, *LeverUp.units)
+"""Everything that may vary."""
 NAMES = tuple(name for name in CONSTANTS if name != EXACT)  # which is not known where it varies
 """What predictors are conditioned on by default."""
 GROUPS = ("printed", "everyday")
@@ -315,7 +318,7 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
     batch = InteractionBatch.from_views(views, times)
     start: Float[np.ndarray, "batch 3"] = np.array([each.observed.com[0] for each in shown])
     told = [Physics(density=each.subject.density) if nominal else each.observed.physics for each in shown]
-    values = [true_context(physics, tuple(CONTEXT)) for physics in told]
+    values = [true_context(physics, CONTEXT) for physics in told]
     context = {name: np.array([each[name] for each in values]) for name in CONTEXT}
     batch = replace(batch, com=np.repeat(start[:, None], len(times), axis=1), parameters=context)
     imagined = predictor.imagine_batch(batch).com
@@ -328,7 +331,7 @@ def distances(predictor: EffectPredictor, shown: Sequence[Shown], nominal: bool 
 
 def _nominal(batch: InteractionBatch) -> InteractionBatch:
     """The same interactions with the nominal constants and action parameters."""
-    values = true_context(Physics(), tuple(CONTEXT))
+    values = true_context(Physics(), CONTEXT)
     constant = {name: np.full(len(batch), value) for name, value in values.items()}
     return replace(batch, parameters=batch.parameters | constant)
 

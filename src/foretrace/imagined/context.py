@@ -27,17 +27,20 @@ UNKNOWN = "unknown"
 """Context in which no constant is told."""
 Context = Mapping[str, float] | Literal["unknown"] | None
 """What an imaginer is told. None: the nominal constants. Values by name: these, and no others. ``unknown``: none."""
-PARAMETERS = {
-    "insertion": "in m",
-    "arc_radius": "in m",
-    "sweep": "in rad",
-    "speed": "as a multiple of the nominal one",
-}
-"""Parameters of the action's path by name."""
-CONTEXT = CONSTANTS | PARAMETERS
-"""Everything that a predictor may be conditioned on."""
 SAME = 1e-9
 """Values of a parameter that differ by less are the same."""
+
+
+def context_units() -> dict[str, str]:
+    """Units of everything that a predictor may be conditioned on: constants, and parameters of all actions' paths."""
+    found: dict[str, list[str]] = {}
+    for kind in ACTIONS.values():
+        for name in kind.nominal_parameters():
+            unit = kind.units.get(name, "in SI units")
+            if all(not other.startswith(unit) for other in found.setdefault(name, [])):
+                found[name].append(f"{unit} ({kind.label})")
+    alone = {name: units[0].rpartition(" (")[0] for name, units in found.items() if len(units) == 1}
+    return CONSTANTS | {name: alone.get(name, ", ".join(units)) for name, units in found.items()}
 
 
 def check_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -47,9 +50,9 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
         TrainingError: One of them is unknown, or comes twice.
     """
     for name in names:
-        if name not in CONTEXT:
+        if name not in context_units():
             raise TrainingError(
-                f"{shown(name)} is no context of a prediction: choose from {', '.join(CONTEXT)}"
+                f"{shown(name)} is no context of a prediction: choose from {', '.join(context_units())}"
             )
         if list(names).count(name) > 1:
             raise TrainingError(f"{shown(name)} is named twice in the context: name it once")
@@ -191,7 +194,7 @@ def _told(
             "nominal ones"
         )
     if not optional and (missing := [name for name in constants if name not in context]):
-        wanted = ", ".join(f"{shown(name)}: value {CONTEXT[name]}" for name in constants)
+        wanted = ", ".join(f"{shown(name)}: value {CONSTANTS[name]}" for name in constants)
         raise PredictionError(
             f"the predictor is conditioned on {', '.join(missing)}: give context={{{wanted}}}, or None for the nominal "
             "values"
@@ -204,7 +207,7 @@ def _told(
     for name, value in context.items():
         if not is_number(value) or not np.isfinite(value):
             raise PredictionError(
-                f"context {name} is {shown(value)}: give a finite value {CONTEXT.get(name, 'in m')}"
+                f"context {name} is {shown(value)}: give a finite value {context_units().get(name, 'in m')}"
             )
         low, high = PHYSICS_RANGES.get(name, (-np.inf, np.inf))
         if not low <= float(value) <= high:

@@ -101,7 +101,7 @@ class Imaginer(ABC):
     """
 
     context: tuple[str, ...] = ()
-    """Variables that it is conditioned on beside the view: names of `foretrace.imagined.context.CONTEXT`."""
+    """Variables that it is conditioned on beside the view: names of `foretrace.imagined.context.context_units`."""
     marginal: bool = False
     """Whether it can do without constants of its context: its futures then cover what is not told."""
     rests: bool = False

@@ -37,6 +37,7 @@ RANGES = (
     "bevel_height_factor",
     "com_offset",
     "execution_share",
+    "distance",
 )
 
 

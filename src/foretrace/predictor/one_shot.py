@@ -1,6 +1,6 @@
 """A direct trajectory predictor: whole motions at once, alternatives with probabilities, and error scales."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from foretrace.errors import TrainingError
-from foretrace.features import Outline
+from foretrace.features import Outline, action_frame, pivot_edges
 from foretrace.features.outline import pixel_error
-from foretrace.features.pivot_edges import NUM_VALUES, PROBES, PivotEdges, find_pivot_edges
+from foretrace.features.pivot_edges import PROBES, PivotEdges
 from foretrace.imagined import (
     LEVELS,
     STARTS,
@@ -22,6 +22,7 @@ from foretrace.imagined import (
     conformal_scores,
     quantiles_of,
 )
+from foretrace.imagined.context import first_action
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.predictor.base import EffectPredictor
@@ -106,6 +107,23 @@ class OneShotConfig(PredictorConfig):
         object.__setattr__(self, "outcomes", tuple(self.outcomes))
 
 
+class Frames(NamedTuple):
+    """Frames along whose axes motions are predicted."""
+
+    find: Callable[..., PivotEdges]
+    """Finds them, and describes the action relative to them."""
+    num_values: int
+    """Numbers in that description."""
+    most: int
+    """Frames of one action, at the most."""
+
+
+FRAMES = {"lever-up": Frames(pivot_edges.find_pivot_edges, pivot_edges.NUM_VALUES, 2)}
+"""By the action's label."""
+ACTION_FRAME = Frames(action_frame.find_action_frame, action_frame.NUM_VALUES, 1)
+"""Of all other actions."""
+
+
 class Outputs(NamedTuple):
     """Outputs of the ensemble for lever-ups and their mirror images, by pivot edge and outcome."""
 
@@ -121,10 +139,11 @@ class OneShotPredictor(EffectPredictor):
     """Predicts whole motions at once, in the frames of the edges that the object may turn about.
 
     From the outline's corners and the centre of mass, `find_pivot_edges` finds two edges in closed form, and describes
-    the lever-up relative to them. For every edge and every outcome networks turn these numbers into a future: its
-    probability; weights in a PCA basis of trajectories (how far the object is displaced and turned, sample by sample,
-    along the edge's axes); and the scale of the error. Futures are never averaged, only the outputs of several networks
-    for the same one. Every lever-up is also seen in the mirror: mirror images have mirrored motions, exactly.
+    the lever-up relative to them; other actions have one frame, that of `find_action_frame`. For every edge and every
+    outcome networks turn these numbers into a future: its probability; weights in a PCA basis of trajectories (how far
+    the object is displaced and turned, sample by sample, along the edge's axes); and the scale of the error. Futures
+    are never averaged, only the outputs of several networks for the same one. Every action is also
+    seen in the mirror: mirror images have mirrored motions, exactly.
 
     Args:
         config: Settings.
@@ -157,7 +176,9 @@ class OneShotPredictor(EffectPredictor):
                 "features 'outline'"
             )
         self.heights = self.features.heights
-        numbers, outcomes = NUM_VALUES + self.heights * PROBES**2, len(self.outcomes)
+        self.frames = FRAMES.get(first_action(self.outcomes).label, ACTION_FRAME)
+        num_values = self.frames.num_values
+        numbers, outcomes = num_values + self.heights * PROBES**2, len(self.outcomes)
         components = config.components
         widths = (config.hidden,) * config.layers
         self.networks = Ensemble(
@@ -185,6 +206,11 @@ class OneShotPredictor(EffectPredictor):
     def is_symmetric(self) -> bool:
         """Whether mirror images have mirrored motions, exactly."""
         return self.config.mirrored
+
+    @property
+    def num_edges(self) -> int:
+        """Candidate pivot edges; 1 where an action turns its object about none."""
+        return min(self.config.pivot_edges, self.frames.most)
 
     def lengths(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:
         """Whole trajectories: the fall after a slip is an effect, too."""
@@ -344,7 +370,7 @@ class OneShotPredictor(EffectPredictor):
         if self.heights:
             heights = features[:, 2 * MAX_CORNERS : self.features.num_features] * UNIT
             heights = heights.unflatten(1, (HEIGHT_CELLS, HEIGHT_CELLS))
-        edges = find_pivot_edges(corners, com, self.config.pivot_edges, heights)
+        edges = self.frames.find(corners, com, self.num_edges, heights)
         if self.config.mirrored:
             return edges
         return replace(edges, values=edges.values[:, :1], axes=edges.axes[:, :1])
@@ -428,7 +454,7 @@ class OneShotPredictor(EffectPredictor):
             spread = torch.hypot(spread, start_spread.double()[:, None, None])
         return Futures(
             probability=mixture.log_probability.flatten(1).exp().double().cpu().numpy(),
-            outcome=self.outcomes * self.config.pivot_edges,
+            outcome=self.outcomes * self.num_edges,
             states=mixture.states().cpu().numpy(),
             spread=spread.cpu().numpy(),
             support_points=ends.double().cpu().numpy(),

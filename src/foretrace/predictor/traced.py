@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from foretrace.geometry import quaternion_to_matrix, rotation_from_6d
 from foretrace.imagined import FLOOR, LEVELS, STARTS
-from foretrace.imagined.context import CONTEXT
+from foretrace.imagined.context import context_units
 from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.predictor.states import decode_poses, rest_states
 
@@ -39,7 +39,8 @@ class TracedPredictor(nn.Module, ABC):
         self.predictor = predictor
         self.inputs = {"com": "centre of mass at rest in the action frame [m]"}
         if predictor.context:
-            meanings = ", ".join(f"{name} {CONTEXT[name]}" for name in predictor.context)
+            units = context_units()
+            meanings = ", ".join(f"{name} {units[name]}" for name in predictor.context)
             hidden = "; NaN: a constant that is not told" if predictor.marginal else ""
             self.inputs["context"] = f"conditioning variables of the action: {meanings}{hidden}"
 
@@ -91,7 +92,7 @@ class TracedDistribution(TracedPredictor):
             for told, values in zip(("told", "unknown"), kinds, strict=True)
         }
         return super().facts() | {
-            "futures": self.predictor.outcomes * self.predictor.config.pivot_edges,
+            "futures": self.predictor.outcomes * self.predictor.num_edges,
             "levels": LEVELS.tolist(),
             "quantiles": quantiles,
             "floor": FLOOR,

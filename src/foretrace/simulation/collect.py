@@ -132,15 +132,9 @@ def planned_trial(config: CollectConfig, id: int) -> lever_up.Trial:
     rng = np.random.default_rng(
         np.random.SeedSequence([config.seed, *_locate(config, id), RANDOMISATION_STREAM])
     )
-    obj, physics, path, error = config.randomisation.vary(obj, config.simulation.physics, config.path, rng)
+    obj, physics, path, error = config.randomisation.vary(obj, config.simulation.physics, action.path, rng)
     simulation = replace(config.simulation, physics=physics)
-    if isinstance(action, LeverUp):
-        action = replace(action, path=path)
-    elif path != config.path:
-        raise SimulationError(
-            f"the path of a {action.label} cannot be varied, only a lever-up's: leave --vary-action out"
-        )
-    return lever_up.Trial(obj, action, simulation, seed, id, error)
+    return lever_up.Trial(obj, replace(action, path=path), simulation, seed, id, error)
 
 
 def simulate_trial(config: CollectConfig, id: int) -> Interaction:

@@ -1,19 +1,21 @@
-"""Lever-ups that differ from their nominal ones: domain randomisation (paper, section 6).
+"""Actions that differ from their nominal ones: domain randomisation (paper, section 6).
 
-The draws of a lever-up depend on the data set's seed and its own number alone, and those of one quantity do not depend
+The draws of an action depend on the data set's seed and its own number alone, and those of one quantity do not depend
 on which others vary.
 """
 
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
-from foretrace.actions import CONTACT_TOLERANCE, ToolPath
+from foretrace.actions import CONTACT_TOLERANCE, PushPath, ToolPath
 from foretrace.errors import SimulationError, check_ranges, is_number, shown, wrong_type
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.objects import Bevel, Box, ObjectModel, Prism, Weighted
 from foretrace.objects.model import inner_radius
 
+Path = TypeVar("Path", ToolPath, PushPath)
 Range = tuple[float, float]
 """Least and greatest value of what is drawn uniformly."""
 LARGEST = {
@@ -26,7 +28,7 @@ LARGEST = {
 
 @dataclass(frozen=True)
 class Randomisation:
-    """What is drawn anew for every lever-up; by default nothing.
+    """What is drawn anew for every action; by default nothing.
 
     Thickness and bevel are those of prisms and boxes. Cylinders and meshes have neither and stay as they are.
 
@@ -64,7 +66,9 @@ class Randomisation:
     """Largest offset of the centre of mass of prisms and boxes, as a share of the radius of the widest circle inside
     the outline. Half of the objects stay uniform, as all do with None."""
     execution_share: float | None = None
-    """Share of the lever-ups that have an execution error; None: all."""
+    """Share of the actions that have an execution error; None: all."""
+    distance: Range | None = None
+    """Distances of pushes [m]. The rod rests at the end until the longest push would be done, too."""
 
     def __post_init__(self) -> None:
         for name in RANGES:
@@ -89,19 +93,20 @@ class Randomisation:
         check_ranges(SimulationError, "randomisation", self, limits)
 
     def vary(
-        self, obj: ObjectModel, physics: Physics, path: ToolPath, rng: np.random.Generator
-    ) -> tuple[ObjectModel, Physics, ToolPath, ExecutionOffset]:
-        """One lever-up's object, constants, path and execution error.
+        self, obj: ObjectModel, physics: Physics, path: Path, rng: np.random.Generator
+    ) -> tuple[ObjectModel, Physics, Path, ExecutionOffset]:
+        """One action's object, constants, path and execution error.
 
         Args:
             obj: The object as configured.
             physics: Friction and density as configured.
-            path: The blade's path as configured.
+            path: The tool's path as configured.
             rng: Random numbers: always one for each setting, in their order.
 
         Raises:
             ShapeError: A thinner object or a wider bevel leaves no bottom face.
             ActionError: No path goes so deep, so far or so fast.
+            SimulationError: What is to be drawn is of another action's path.
         """
         # Numbers of its own, which do not move those of other settings.
         (own,) = rng.spawn(1)
@@ -116,9 +121,7 @@ class Randomisation:
             ahead = left = turn = 0.0
         constants = {name: drawn[name] for name in CONSTANTS if name in drawn}
         factors = [drawn.get(name, 1.0) for name in FACTORS]
-        path = replace(path, **{name: drawn[name] for name in PATH if name in drawn})
-        if self.speed is not None:
-            path = _sped_up(path, drawn["speed"], slowest=self.speed[0])
+        path = self._drawn_path(path, {name: drawn[name] for name in (*PATH, "speed") if name in drawn})
         varied = reshaped(obj, *factors)
         if self.com_offset is not None:
             varied = off_centre(varied, self.com_offset * max(0.0, 2 * shares["com_offset"] - 1), own)
@@ -128,6 +131,17 @@ class Randomisation:
             path,
             ExecutionOffset(ahead, left, turn),
         )
+
+    def _drawn_path(self, path: Path, drawn: dict[str, float]) -> Path:
+        if odd := [name for name in drawn if name not in OWN_PATH[type(path)]]:
+            raise SimulationError(f"{odd[0]} cannot be drawn of a {type(path).__name__}: leave it out")
+        if isinstance(path, PushPath):
+            if self.distance is None:
+                return path
+            rest = (self.distance[1] - drawn["distance"]) / path.speed
+            return replace(path, distance=drawn["distance"], hold_time=path.hold_time + rest)
+        path = replace(path, **{name: value for name, value in drawn.items() if name != "speed"})
+        return path if self.speed is None else _sped_up(path, drawn["speed"], slowest=self.speed[0])
 
 
 def _sped_up(path: ToolPath, speed: float, slowest: float) -> ToolPath:
@@ -140,8 +154,10 @@ CONSTANTS = ("friction", "tool_friction", "density")
 """What is drawn of `Physics`."""
 FACTORS = ("thickness_factor", "bevel_width_factor", "bevel_height_factor")
 """What is drawn of the object's shape."""
-PATH = ("insertion", "arc_radius", "sweep")
-"""What is drawn of the blade's path, as it stands in `ToolPath`."""
+PATH = ("insertion", "arc_radius", "sweep", "distance")
+"""What is drawn of a path, as it stands there."""
+OWN_PATH = {ToolPath: ("insertion", "arc_radius", "sweep", "speed"), PushPath: ("distance",)}
+"""What can be drawn of each kind of path."""
 RANGES = (*CONSTANTS, *FACTORS, *PATH, "speed")
 NOTHING = Randomisation()
 """Every lever-up as commanded, of the nominal object."""

@@ -26,7 +26,7 @@ from foretrace.imagined import (
     conformal_scores,
     quantiles_of,
 )
-from foretrace.imagined.context import CONSTANTS, PARAMETERS
+from foretrace.imagined.context import CONSTANTS
 from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.objects import ObjectModel, Weighted
@@ -114,7 +114,7 @@ class TwinImaginer(Imaginer):
         PredictionError: The engine is unknown or not installed, or a value is not usable.
     """
 
-    context = (*CONSTANTS, *PARAMETERS)
+    context = (*CONSTANTS, *LeverUp.units)
     marginal = True
 
     def __init__(
@@ -309,7 +309,7 @@ class TwinImaginer(Imaginer):
             if not isinstance(action, LeverUp):
                 raise PredictionError(f"candidate {row} is a {action.label}: the twin plays lever-ups")
             return action
-        settings = {name: values[name] for name in PARAMETERS if np.isfinite(values[name])}
+        settings = {name: values[name] for name in LeverUp.units if np.isfinite(values[name])}
         try:
             return LeverUp((0.0, 0.0), (1.0, 0.0), _path(settings))
         except ActionError as error:
