@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action
 from foretrace.imagined import ImaginedEffect
 from foretrace.imagined.futures import carried_poses
 from foretrace.imagined.shown import LEVEL, in_order, percentage, radius_of
@@ -54,7 +54,7 @@ def other_motions(imagined: ImaginedEffect, T_action_object: np.ndarray) -> list
 
 def scene_of(
     obj: ObjectModel,
-    action: LeverUp,
+    action: Action,
     imagined: ImaginedEffect,
     name: str,
     truth: Interaction | None = None,
@@ -66,14 +66,15 @@ def scene_of(
         action: The action.
         imagined: What is predicted; samples after the action's end are left out.
         name: What the predictor is called.
-        truth: The simulated lever-up.
+        truth: The simulated action.
     """
     imagined = imagined.until(action.duration)
     placement, color = action.T_action_object, PREDICTION_COLORS[0]
     pose, paths = imagined.object_poses(placement), {name: imagined.com_trajectory}
     if truth is not None and len(truth.effect.times) > 0:
         scene = replace(
-            Scene.observed(truth, paths), title=f"Predicted and simulated lever-up: {truth.effect.outcome}"
+            Scene.observed(truth, paths),
+            title=f"Predicted and simulated {action.label}: {truth.effect.outcome}",
         )
         ghosts = [] if pose is None else [Ghost(pose, color, 1.0)]
     else:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from foretrace.actions import LeverUp
+from foretrace.actions import Action
 from foretrace.errors import DatasetError, PredictionError
 from foretrace.geometry import (
     matrix_to_pose,
@@ -130,19 +130,23 @@ class Scene:
     def imagined(
         cls,
         obj: ObjectModel,
-        action: LeverUp,
+        action: Action,
         times: Float[np.ndarray, " time"],
         predictions: Mapping[str, np.ndarray],
         pose: Float[np.ndarray, "time 7"] | None = None,
     ) -> "Scene":
-        """A lever-up that has not happened, with the blade's planned path.
+        """An action that has not happened, with the tool's planned path.
 
         Without imagined poses the object is drawn at rest, and the title says so.
         """
         at_rest = np.tile(matrix_to_pose(action.T_action_object), (len(times), 1))
         planned = action.tool_motion(times)
         turned = rotation_vector_to_quaternion(planned[:, 3:])
-        title = "Predicted lever-up" if pose is not None else "Predicted path of a lever-up; object at rest"
+        title = (
+            f"Predicted {action.label}"
+            if pose is not None
+            else f"Predicted path of a {action.label}; object at rest"
+        )
         return cls(
             obj=obj,
             placement=action.T_action_object,
