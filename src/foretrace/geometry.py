@@ -308,11 +308,12 @@ def wrap_angle(angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"
 
 
 def rotate_plane(
-    vectors: Float[np.ndarray, "n 2"], angle: Float[np.ndarray, " n"] | float
-) -> Float[np.ndarray, "n 2"]:
-    """Vectors in the plane, each rotated to the left [rad]."""
+    vectors: Float[np.ndarray, "*n 2"], angle: Float[np.ndarray, "*m"] | float
+) -> Float[np.ndarray, "*k 2"]:
+    """Vectors in the plane, each rotated to the left [rad]; shapes are broadcast."""
     c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=1)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
 def tilt(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:

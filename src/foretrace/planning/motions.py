@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from foretrace.actions import Action
 from foretrace.errors import PlanningError
-from foretrace.geometry import convex_hull, wrap_angle
+from foretrace.geometry import convex_hull, rotate_plane, wrap_angle
 from foretrace.imagined import Futures, ImaginedBatch
 
 SAME_TIME = 1e-9
@@ -127,6 +127,17 @@ class Motions:
             self.outline,
             self.height,
         )
+
+    def moved_on(self, by: Float[np.ndarray, "batch 3"]) -> "Motions":
+        """Motions that end elsewhere, by x, y [m] and a turn [rad] in the frame where each ends; evenly over time."""
+        share = np.clip(np.arange(len(self.times)) / np.maximum(self.end, 1)[:, None], 0.0, 1.0)
+        turn = (share * by[:, 2:])[:, None]  # (batch, 1, time)
+        turned = self.turned + np.stack([0 * turn, 0 * turn, turn], axis=-1)
+        start = self.com[:, :, :1, :2]
+        shift = share[:, None, :, None] * by[:, None, None, :2] + rotate_plane(start, turn) - start
+        com = self.com.copy()
+        com[..., :2] += rotate_plane(shift, self.heading[:, :, None])
+        return replace(self, com=com, turned=turned)
 
     def resting_frames(self) -> tuple[Float[np.ndarray, "batch 4 4"], Bool[np.ndarray, " batch"]]:
         """The object's frame at the end of each likeliest motion, in its frame at rest; and whether it lies flat again.

@@ -1,7 +1,7 @@
 """The stages of a plan: candidates on the whole outline, refinement of the best, check of the best few."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from foretrace.imagined import Belief, ImaginedBatch, ImaginedEffect, Imaginer
 from foretrace.imagined.context import Context
 from foretrace.planning.candidates import Candidates, Rim, Scene, find_free, place
 from foretrace.planning.goals import Goal, describe
+from foretrace.planning.lessons import Lesson, taught
 from foretrace.planning.motions import Motions
 from foretrace.planning.result import Alternative, Plan, RimCost, Stage
 from foretrace.planning.scores import Scores, check_outcomes, score
@@ -63,9 +64,14 @@ class Search:
     reach: Callable[[Action], str | None] | None = None
     known: "Search | None" = None
     """A search for the same object, which has imagined the candidates around the outline."""
+    lessons: Sequence[Lesson] = ()
+    """What earlier actions on the object have shown."""
     rim: Rim = field(init=False)
     rim_cost: RimCost = field(init=False)
+    imagined: Motions = field(init=False)
+    """Motions of the candidates around the outline, as imagined."""
     around: Motions = field(init=False)
+    """The same after the lessons."""
     lost: Counter[str] = field(default_factory=Counter, init=False)
     stages: list[Stage] = field(default_factory=list, init=False)
 
@@ -154,7 +160,8 @@ class Search:
                 f"no contact of the object is free ({why}): move it by hand, or give a smaller cone or another view"
             )
         same = self.known is not None and self.known.scene.object is self.scene.object is not None
-        self.around = self.known.around if self.known and same else self.motions(self.imaginer, pool)
+        self.imagined = self.known.imagined if self.known and same else self.motions(self.imaginer, pool)
+        self.around = taught(self.imagined, self.lessons)
         scores = self._score(self.around)
         self.rim_cost = self._rim_cost(pool, scores)
         self._tell("imagined", pool, scores, started, None)
@@ -176,7 +183,7 @@ class Search:
                 paths = self._draw_paths(shares, TURN_SHARE * width)
             drawn = self._free(place(self.kind, self.rim, along, turn, paths), count=False)
             if len(drawn):
-                scores = scores.joined(self._score(self.motions(self.imaginer, drawn)))
+                scores = scores.joined(self._score(taught(self.motions(self.imaginer, drawn), self.lessons)))
                 pool = pool.joined(drawn)
         self._tell("refined", pool, scores, started, self.stages[-1].cost)
         return pool, scores

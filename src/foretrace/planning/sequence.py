@@ -1,6 +1,6 @@
 """Sequences: several actions in a row, by where each is expected to leave the object."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -21,6 +21,7 @@ from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
 from foretrace.planning.goals import Goal, as_goal, describe
 from foretrace.planning.goals.base import LEVERED
+from foretrace.planning.lessons import Lesson
 from foretrace.planning.motions import Motions
 from foretrace.planning.plan import PlanConfig
 from foretrace.planning.result import Plan
@@ -195,8 +196,8 @@ def execute_sequence(
         imaginer: As of `plan_sequence`.
         context: What it is told.
         config: As of `plan_sequence`.
-        replan: Plan again after each action; otherwise the first sequence is carried out as it was planned, where
-            the object is expected.
+        replan: Plan again after each action: one like an earlier one is expected to miss its imagined end by as much.
+            Otherwise the first sequence is carried out as planned, where the object is expected.
 
     Raises:
         PlanningError: As `plan_sequence`, before the first action; later, a plan that cannot be made ends the
@@ -212,12 +213,13 @@ def execute_sequence(
     expected: list[tuple[Action, np.ndarray]] = []
     state = _state(aim, scene, com, np.eye(4))
     known: Search | None = None
+    lessons: list[Lesson] = []
     while len(actions) < steps and not state[1]:
         if replan or not sequences:
             try:
                 if actions:
                     scene = replace(Scene.of(_observed(world)), T_start_now=frames[-1], com_start=com)
-                found, known = _plan(scene, aim, steps - len(actions), own, context, config, known)
+                found, known = _plan(scene, aim, steps - len(actions), own, context, config, known, lessons)
             except ForetraceError:
                 if not actions:
                     raise
@@ -233,6 +235,9 @@ def execute_sequence(
         outcomes.append(world.act(action, T_table_start @ T_start_now))
         actions.append(action)
         frames.append(T_start_table @ _located(world))
+        if replan:
+            moved = (invert_transform(a) @ b for a, b in (found.frames[:2], frames[-2:]))
+            lessons.append(Lesson.of(action, *moved))
         state = _state(aim, scene, com, frames[-1], outcomes[-1])
     return Execution(
         tuple(actions), tuple(outcomes), np.array(frames), tuple(sequences), bool(state[1]), float(state[0])
@@ -293,9 +298,10 @@ def _plan(
     context: Context | Belief,
     config: PlanConfig,
     known: Search | None = None,
+    lessons: Iterable[Lesson] = (),
 ) -> tuple[Sequence, Search]:
     """The best sequence from how the object lies now, and its search, which later ones begin with."""
-    search = Search(scene, aim, imaginer, None, context, config, known=known)
+    search = Search(scene, aim, imaginer, None, context, config, known=known, lessons=tuple(lessons))
     around, scores = search.look_around()
     pool, scores = search.refine(around, scores) if config.refine else (around, scores)
     start = np.eye(4) if scene.T_start_now is None else scene.T_start_now
