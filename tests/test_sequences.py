@@ -1,6 +1,7 @@
 """Sequences of actions: composed, carried out, and planned again."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from foretrace.geometry import planar_transform, transform_points
 from foretrace.imagined import Futures, ImaginedBatch
 from foretrace.objects import NO_BEVEL
 from foretrace.planning import Motions, execute_sequence, plan_sequence
+from foretrace.planning.lessons import Lesson, taught
 from foretrace.planning.motions import placed
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.world import SimulatedWorld
@@ -106,6 +108,44 @@ def test_thinned_motions_keep_start_and_end():
     np.testing.assert_allclose(few.end_com, found.end_com)
     np.testing.assert_allclose(few.heading, found.heading)
     np.testing.assert_allclose(few.shift, found.shift)
+
+
+def test_an_action_that_was_seen_to_end_elsewhere_is_expected_there():
+    found = motions()
+    action, imagined = found.actions[0], found.resting_frames()[0][0]
+    observed = imagined @ planar_transform([0.004, -0.002, 0.0], -0.3)
+    lesson = Lesson.of(action, imagined, observed)
+    again = taught(found, [lesson])
+    np.testing.assert_allclose(again.resting_frames()[0][0], observed, atol=1e-12)
+    np.testing.assert_allclose(again.com[0, 0, 0], found.com[0, 0, 0], atol=1e-12)
+    twice = taught(found, [lesson, Lesson.of(action, imagined, imagined)])
+    np.testing.assert_allclose(twice.heading, found.heading - 0.15)
+    unlike = [action.moved(0.0, 0.08, 0.0), replace(action, path=ft.PushPath(distance=0.02))]
+    for other in unlike:
+        np.testing.assert_allclose(taught(found, [replace(lesson, action=other)]).com, found.com, atol=1e-9)
+    np.testing.assert_allclose(Lesson.of(action, imagined, np.diag([1.0, -1.0, -1.0, 1.0])).error, 0.0)
+
+
+class Stubborn(Moved):
+    """A world in which the first push that is tried moves nothing."""
+
+    stuck = None
+
+    def act(self, action, T_table_object):
+        self.stuck = self.stuck or action
+        if np.linalg.norm(action.contact - self.stuck.contact) < 0.005:
+            self.T = T_table_object
+            return "missed"
+        return super().act(action, T_table_object)
+
+
+def test_what_did_not_work_is_not_tried_again_and_again():
+    goal = ft.goals.MoveTo((0.0, 0.03), tolerance=0.01)
+    config = replace(QUICK, refine=0, directions=1, vary_path=False)
+    found = execute_sequence(Stubborn(), goal, 4, TWIN, config=config)
+    tried = [np.linalg.norm(each.contact - found.actions[0].contact) < 0.005 for each in found.actions]
+    assert tried[0]
+    assert not all(tried)
 
 
 def test_a_sequence_goes_where_one_push_does_not(tmp_path):
