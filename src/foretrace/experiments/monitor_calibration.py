@@ -8,16 +8,18 @@ import argparse
 from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from foretrace.errors import ResultsError
 from foretrace.experiments.executions import CAUSES, FAULTS, MOVED, Execution, make_execution
+from foretrace.experiments.push_executions import KIND, push_executions
 from foretrace.files import write_json
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import LEVELS, Belief, ImaginedEffect, conformal_scores
 from foretrace.monitoring import Monitor, MonitorCalibration
-from foretrace.monitoring.calibration import FORMAT, SHIPPED, VERSION
+from foretrace.monitoring.calibration import FORMAT, SHIPPED, VERSION, shipped
 from foretrace.monitoring.causes import CauseModel
 from foretrace.predictor import EffectPredictor, load_predictor
 from foretrace.workers import count_workers, run_jobs
@@ -129,12 +131,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--executions", type=int, default=1000)
     parser.add_argument("--faults", type=int, default=60)
+    parser.add_argument("--pushes", type=int, default=300)
+    parser.add_argument("--pushes-only", action="store_true", help="keep what the file has of lever-ups")
     parser.add_argument("--out", type=Path, default=SHIPPED)
     options = parser.parse_args()
-    found, causes = calibrate(options.executions, options.faults, count_workers(None, ResultsError))
-    kinds = {kind: each.entries() for kind, each in found.items()}
-    content = {"format": FORMAT, "version": VERSION, "kinds": kinds, "causes": causes.entries()}
-    write_json(options.out, content)
+    workers = count_workers(None, ResultsError)
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION, **shipped()}
+    if not options.pushes_only:
+        found, causes = calibrate(options.executions, options.faults, workers)
+        content |= {
+            "kinds": {kind: each.entries() for kind, each in found.items()},
+            "causes": causes.entries(),
+        }
+    rows = [tuple(range(k, min(k + CHUNK, options.pushes))) for k in range(0, options.pushes, CHUNK)]
+    parts = run_jobs(push_scores, rows, workers, error=ResultsError, ordered=True)
+    pushed = MonitorCalibration.of([score for part in parts for score in part], about=f"{KIND}, seed {SEED}")
+    write_json(options.out, content | {"kinds": content["kinds"] | {KIND: pushed.entries()}})
+
+
+def push_scores(numbers: tuple[int, ...]) -> list[float]:
+    """Scores of monitors of normal pushes."""
+    return [
+        Monitor(free.imagined, calibration=OPEN).score_of(free.times, free.tracked)
+        for free, _ in (push_executions(SEED, number) for number in numbers)
+    ]
 
 
 if __name__ == "__main__":

@@ -66,12 +66,17 @@ class MonitorCalibration:
     def shipped(cls, kind: str) -> "MonitorCalibration":
         """The one that comes with foretrace, for effects imagined with a belief (``worlds``) or without (``futures``).
 
+        The label of another action than the lever-up comes before: ``push worlds``.
+
         Raises:
             MonitoringError: There is no such kind.
         """
         kinds = shipped()["kinds"]
         if kind not in kinds:
-            raise MonitoringError(f"kind {shown(kind)} is unknown: choose from {', '.join(kinds)}")
+            raise MonitoringError(
+                f"no calibration of monitors for {shown(kind)} comes with foretrace, only for {', '.join(kinds)}: "
+                "imagine with a Belief as context, or give a calibration of your own"
+            )
         return cls.of_entries(kinds[kind], SHIPPED.name)
 
     def threshold(self, false_alarms: float) -> float:
@@ -157,7 +162,7 @@ def check_calibration(calibration: Any, kind: str) -> MonitorCalibration:
 
     Args:
         calibration: What was given.
-        kind: Kind of imagined effect, ``worlds`` or ``futures``.
+        kind: Kind of imagined effect: ``worlds``, ``futures`` or ``push worlds``.
 
     Raises:
         MonitoringError: It is something else, or the file cannot be used.

@@ -18,6 +18,7 @@ from foretrace.geometry import (
     quaternion_to_matrix,
 )
 from foretrace.imagined import ImaginedEffect
+from foretrace.imagined.context import first_action
 from foretrace.monitoring.calibration import MonitorCalibration, check_calibration, shipped
 from foretrace.monitoring.causes import BAD_INPUT, FROZEN, LOST, SURE, UNKNOWN, CauseModel, evidence
 from foretrace.monitoring.motions import TURN_LENGTH, motions_of, place_of
@@ -94,7 +95,7 @@ class Monitor:
             raise MonitoringError(f"clock_error is {shown(clock_error)}: give seconds from 0 to 0.5")
         self.imagined = effect
         """What was imagined."""
-        self.calibration = check_calibration(calibration, "futures" if effect.worlds is None else "worlds")
+        self.calibration = check_calibration(calibration, _kind(effect))
         """Scores of normal executions."""
         self.threshold = self.calibration.threshold(float(false_alarms))
         """Score above which there is an alarm."""
@@ -368,6 +369,13 @@ def _seven(pose: Any) -> Float[np.ndarray, "7"]:
             f"pose is {shown(pose)}: give position [m] and quaternion (w, x, y, z), seven numbers, or None"
         )
     return found
+
+
+def _kind(effect: ImaginedEffect) -> str:
+    """Which of the calibrations that come with foretrace belongs to an effect: by its action, and whether believed."""
+    kind = "futures" if effect.worlds is None else "worlds"
+    action = first_action(effect.futures.outcome)
+    return kind if action is first_action() else f"{action.label} {kind}"
 
 
 def _wrong_pose(pose: Float[np.ndarray, "7"]) -> str | None:
