@@ -236,7 +236,7 @@ def execute_sequence(
         actions.append(action)
         frames.append(T_start_table @ _located(world))
         if replan:
-            moved = (invert_transform(a) @ b for a, b in (found.frames[:2], frames[-2:]))
+            moved = (invert_transform(a) @ b for a, b in (sequences[-1].frames[:2], frames[-2:]))
             lessons.append(Lesson.of(action, *moved))
         state = _state(aim, scene, com, frames[-1], outcomes[-1])
     return Execution(
