@@ -24,6 +24,7 @@ from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.tables import markdown_table
 from foretrace.experiments import SUMMARIES
 from foretrace.imagined import ImaginedBatch, Imaginer, Scenes
+from foretrace.imagined.context import EXACT, Context
 from foretrace.interactions.batch import Candidates
 from foretrace.interactions.pushes import RecordedPushes
 from foretrace.interactions.record import Physics
@@ -33,7 +34,7 @@ from foretrace.pictures.style import GREY, INK, new_figure, styled
 from foretrace.planning import Execution, PlanConfig, execute_sequence, goals
 from foretrace.planning.goals import Goal
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
-from foretrace.simulation.randomisation import RANDOMISED
+from foretrace.simulation.randomisation import RANDOMISED, Randomisation
 from foretrace.simulation.world import SimulatedWorld
 from foretrace.twin import TwinConfig, TwinImaginer
 from foretrace.twin.sliding import SlidingTwin
@@ -42,16 +43,16 @@ TASKS = ("push", "turn", "edge")
 """Push to a pose; turn by a quarter and walk to the table's edge by lever-ups."""
 METHODS = {
     "push": ("identified", "nominal", "identified, blind", "nominal, blind"),
-    "turn": ("nominal", "nominal, blind"),
-    "edge": ("nominal", "nominal, blind"),
+    "turn": ("several worlds", "nominal", "nominal, blind"),
+    "edge": ("several worlds", "nominal", "nominal, blind"),
 }
-"""``nominal`` and ``identified``: constants of the twin. Blind: planned once."""
+"""``nominal`` and ``identified``: constants of the twin. ``several worlds``: these are drawn. Blind: planned once."""
 WORDS = {
     "push": "Push to a pose within 5 mm and 5 degrees",
     "turn": "Turn by 90 degrees within 10, by lever-ups",
     "edge": "Walk 6 cm to the table's edge by lever-ups",
 }
-STEPS = {"push": 5, "turn": 8, "edge": 8}
+STEPS = {"push": 5, "turn": 12, "edge": 12}
 """Actions, at most."""
 STREAM = 83
 """Tells the random numbers of these objects from those of other experiments with the same seed."""
@@ -71,6 +72,15 @@ EDGE = 0.06
 """Distance of the centre of mass from the table's edge at the start of the task ``edge`` [m]."""
 PUSH_SEARCH = PlanConfig(spacing=0.02, refine=3, samples=24, check=0)
 LEVER_SEARCH = PlanConfig(spacing=0.02, directions=1, refine=0, check=0)
+NOT_TOLD = ("friction", "tool_friction", "density")
+"""Constants that are drawn for every object that is levered up, and in the worlds of a twin that is not told them."""
+LEVER_TWIN = TwinConfig(
+    worlds=8,
+    set_down=True,
+    outline_noise=0.0,
+    ranges=Randomisation(**{name: getattr(RANDOMISED, name) for name in NOT_TOLD}),
+    workers=1,
+)
 PUSHED = SimulationConfig(embodiment="tool", timestep=0.004, sample_period=0.04)
 MEDIANS = ("position_mm", "rotation_deg", "seconds")
 DRAWS = 2000
@@ -167,7 +177,7 @@ class Sequences(Experiment):
     def _lever(self, trial: SequenceTrial, rng: np.random.Generator) -> list[Row]:
         number = trial.number
         obj = sample_box(rng) if number % 2 else sample_prism(rng, 3 + (number // 2) % 8)
-        drawn = {name: getattr(RANDOMISED, name) for name in ("friction", "tool_friction", "density")}
+        drawn = {name: getattr(RANDOMISED, name) for name in NOT_TOLD}
         physics = Physics(**{name: float(rng.uniform(*limits)) for name, limits in drawn.items()})
         config = SimulationConfig(embodiment="tool", physics=physics)
         side, angle = rng.choice([-1.0, 1.0]), rng.uniform(0, 2 * np.pi)
@@ -177,9 +187,17 @@ class Sequences(Experiment):
             "turn": goals.Turn(float(side * QUARTER), float(QUARTER_OFF)),
             "edge": goals.SlideOff(edge, outward),
         }
-        twin = Remembered(TwinImaginer(config=TwinConfig(set_down=True, workers=1)))
+        kept = {name: Remembered(TwinImaginer(config=LEVER_TWIN)) for name in ("several worlds", "nominal")}
         return [
-            _row(task, method, SimulatedWorld(obj, config), goal, twin, LEVER_SEARCH)
+            _row(
+                task,
+                method,
+                SimulatedWorld(obj, config),
+                goal,
+                kept[method.split(",")[0]],
+                LEVER_SEARCH,
+                {EXACT: 0.0} if method == "several worlds" else None,
+            )
             for task, goal in wanted.items()
             for method in METHODS[task]
         ]
@@ -256,12 +274,18 @@ class Remembered(Imaginer):
 
 
 def _row(
-    task: str, method: str, world: SimulatedWorld, goal: Goal, imaginer: Imaginer, search: PlanConfig
+    task: str,
+    method: str,
+    world: SimulatedWorld,
+    goal: Goal,
+    imaginer: Imaginer,
+    search: PlanConfig,
+    context: Context = None,
 ) -> Row:
     """What became of one episode."""
     started, aim = perf_counter(), goal if task == "push" else goal + goals.KeepUpright()
     found = execute_sequence(
-        world, aim, STEPS[task], imaginer, config=search, replan=not method.endswith("blind")
+        world, aim, STEPS[task], imaginer, context, config=search, replan=not method.endswith("blind")
     )
     seconds = perf_counter() - started
     position, rotation = _off(goal, world, found)
