@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import foretrace as ft
+from factories import write_push_table
 from foretrace.errors import PlanningError, PredictionError
+from foretrace.interactions.pushes import read_pushes
+from foretrace.interactions.pushes_data import end_time, push_interaction
 from foretrace.objects import NO_BEVEL
 from foretrace.simulation.sliding import Footprint, slide, slide_along
 from foretrace.twin.sliding import NAMES, SlidingTwin
@@ -42,6 +45,28 @@ def test_an_imagined_push_is_that_of_the_quasi_static_model(fraction):
     moved = imagined.com_trajectory[-1, :2] - imagined.com_trajectory[0, :2]
     np.testing.assert_allclose(moved, push.T_action_object[:2, :2] @ shift[0], atol=1e-3)
     np.testing.assert_allclose(imagined.futures.states[0, 0, -1, 5], turn[0], atol=0.02)
+
+
+def test_regions_hold_pushes_that_were_carried_out(tmp_path):
+    """Known at their ends alone, and pushed farther and less exactly than the twin says."""
+    pushes = read_pushes(*write_push_table(tmp_path, 120, farther=0.002, noise=0.002))[0]
+    twin = ft.SlidingTwin(steps=8).calibrated(pushes[:60])
+    end, rows = end_time(pushes), range(60, 120)
+    held = []
+    for made in (push_interaction(pushes, row, end, row) for row in rows):
+        if made is None:
+            continue
+        imagined = twin.imagine(made.view, made.action)
+        last = int(np.searchsorted(imagined.times, made.action.path.duration)) - 1
+        off = np.linalg.norm(imagined.com_trajectory[last] - made.effect.com_trajectory[-1])
+        held.append([off <= imagined.futures.radius(level)[0, 0, last] for level in (0.5, 0.9)])
+    half, most = np.mean(held, axis=0)
+    assert 0.3 < half < 0.7
+    assert 0.78 < most < 1.0
+    at_rest = imagined.futures.radius(0.9)[0, 0, 0]
+    assert at_rest < 0.5 * imagined.futures.radius(0.9)[0, 0, -1]
+    with pytest.raises(PredictionError, match="no push to calibrate with"):
+        ft.SlidingTwin().calibrated(pushes[:0])
 
 
 def test_what_is_not_told_widens_the_regions():

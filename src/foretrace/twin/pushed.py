@@ -1,6 +1,6 @@
 """Motions of pushed objects over time, by the quasi-static model, and the futures that they make."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -119,3 +119,13 @@ def gather_pushes(
     likeliest = means[np.arange(count), best]
     pose = np.concatenate([likeliest[..., :3], rotation_vector_to_quaternion(likeliest[..., 3:])], axis=-1)
     return ImaginedBatch(times, likeliest[..., :3], pose, futures)
+
+
+def with_regions(futures: Futures, errors: Float[np.ndarray, " pushes"]) -> Futures:
+    """Futures of single worlds with regions that grow to the errors of pushes that were carried out [m]."""
+    usual = float(np.sqrt(np.mean(errors**2)))
+    way = np.linalg.norm(futures.com - futures.com[:, :, :1], axis=-1)
+    whole = np.maximum(way[..., -1:], FLOOR)
+    return replace(
+        futures, spread=usual * np.minimum(way / whole, 1.0), quantiles=quantiles_of(errors / (usual + FLOOR))
+    )

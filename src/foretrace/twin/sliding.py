@@ -23,7 +23,7 @@ from foretrace.objects.footed import feet_of
 from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.sliding import Footprint, slide
 from foretrace.twin.outline import SeenObject, see_object
-from foretrace.twin.pushed import OUTCOMES, PushWorlds, gather_pushes, states_over_time
+from foretrace.twin.pushed import OUTCOMES, PushWorlds, gather_pushes, states_over_time, with_regions
 
 NAMES = (
     "friction",
@@ -102,6 +102,8 @@ class SlidingTwin(Imaginer):
     """Steps into which an imagined push is cut."""
     seed: int = 0
     """Decides what is drawn."""
+    errors: Float[np.ndarray, " pushes"] | None = None
+    """How far centres of objects that were pushed came to rest from where the twin predicts them [m]."""
 
     context = ("tool_friction", EXACT, *Push.nominal_parameters())
     marginal = True
@@ -174,6 +176,8 @@ class SlidingTwin(Imaginer):
                     model, places, several, some, scenes.com[few], turns, worlds
                 )
         imagined = gather_pushes(states, outcome, self.sample_times)
+        if worlds == 1 and self.errors is not None:
+            imagined = replace(imagined, futures=with_regions(imagined.futures, self.errors))
         return replace(imagined, warnings=tuple(each.notes for each in seen))
 
     def _see(self, scenes: Scenes) -> list[SeenObject]:
@@ -281,6 +285,26 @@ class SlidingTwin(Imaginer):
         for group, rows in groups_of(pushes).items():
             found[rows] = _play(pushes[rows], self.own.get(group, self.shared)[None], change)[0]
         return found
+
+    def calibrated(self, pushes: RecordedPushes) -> "SlidingTwin":
+        """The twin with regions that as many of such pushes hold as they say (split-conformal), where all is told.
+
+        Pushes may be known at their ends alone: before its end, a motion's region is narrower as it has come less far.
+
+        Args:
+            pushes: Pushes that were carried out, none of those that the constants were identified from.
+
+        Raises:
+            PredictionError: There are no pushes.
+        """
+        if len(pushes) == 0:
+            raise PredictionError("no push to calibrate with: give at least twenty")
+        centre = np.array([shape.centroid for shape in pushes.shapes])[pushes.shape]
+        ends = [
+            moved[:, :2] + rotate_plane(centre, moved[:, 2])
+            for moved in (self.predict(pushes), pushes.displacement())
+        ]
+        return replace(self, errors=np.linalg.norm(ends[0] - ends[1], axis=1))
 
     @classmethod
     def identified(cls, pushes: RecordedPushes, seed: int = 0) -> "SlidingTwin":
