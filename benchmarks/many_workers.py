@@ -52,7 +52,7 @@ class Options:
 
 
 def manifest_seconds(shards: int) -> tuple[float, int]:
-    """Time to write a manifest of so many shards [s], and its size."""
+    """Time to write a manifest of a number of shards [s], and its size [bytes]."""
     entry = {"sha256": 64 * "0", "rows": 100}
     manifest = storage.new_manifest({}, shards * 100, 100, {})
     manifest["shards"] = {storage.shard_name(k): entry for k in range(shards)}

@@ -194,7 +194,7 @@ def legend(fig: Figure, names: Iterable[str], extra: Sequence[Line2D] = (), *, l
 
 
 def columns_of(count: int) -> int:
-    """Columns of a legend of so many entries: rows as equally long as can be, so that none is left alone."""
+    """Columns of a legend with a number of entries: its rows differ in length as little as possible."""
     lines = max(1, -(-count // MOST_COLUMNS))
     return max(1, -(-count // lines))
 

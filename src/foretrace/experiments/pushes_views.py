@@ -26,9 +26,9 @@ OUTCOMES = (str(PushOutcome.PUSHED), str(PushOutcome.TURNED_AWAY))
 CONTEXT = ("distance", "speed")
 """What predictors are conditioned on beside the view."""
 EPOCHS = 60
-"""Passes over the training part, as many for each predictor."""
+"""Passes of each predictor over the training part."""
 VALIDATION = 10
-"""One push of so many is not learned from: it decides which epoch is kept, and gives errors for the regions."""
+"""One push in ten validates: these pushes decide which epoch is kept, and their errors make the regions."""
 VIEWED = {
     "im-cnn": LstmConfig(features="im-cnn", state="pose", mirrored=True, context=CONTEXT),
     "one-shot": OneShotConfig(outcomes=OUTCOMES, context=CONTEXT),
