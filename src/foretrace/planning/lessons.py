@@ -1,4 +1,4 @@
-"""What earlier actions of a sequence have shown: where they left the object, against where they were expected to."""
+"""Lessons of earlier actions in a sequence: where they left the object, compared with where they were expected to."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,8 @@ from foretrace.geometry import invert_transform
 from foretrace.planning.motions import FLAT, Motions
 
 NEAR, ALIKE = 0.01, 0.2
-"""An action is like an earlier one by how near its contact [m] and how similar its direction is [rad]."""
+"""Distance of two contacts [m] and angle between two directions [rad], in standard deviations of which a Gaussian
+measures how alike two actions are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,13 +22,13 @@ class Lesson:
     action: Action
     """The action, in the object's frame before it."""
     error: Float[np.ndarray, "3"]
-    """Where the object came to rest, in the frame where it was expected: x, y [m] and turn [rad]."""
+    """Resting pose of the object in the frame in which it was expected: x, y [m] and turn [rad]."""
 
     @classmethod
     def of(
         cls, action: Action, expected: Float[np.ndarray, "4 4"], observed: Float[np.ndarray, "4 4"]
     ) -> "Lesson":
-        """What an action has shown; nothing where the object was expected or observed to lie on another side.
+        """The lesson of an action; its error is zero where the object was expected or observed on another side.
 
         Args:
             action: The action, in the object's frame before it.
@@ -41,9 +42,9 @@ class Lesson:
 
 
 def taught(motions: Motions, lessons: Sequence[Lesson]) -> Motions:
-    """Motions that end as those of like actions did: their errors are added, the more alike, the more of them.
+    """Motions corrected by the errors of similar earlier actions, each weighted by how alike the two actions are.
 
-    Of several lessons about an action, the mean counts. An action on another path is not alike.
+    Of several lessons about an action, the mean counts. Actions on different paths are not alike.
     """
     if not lessons:
         return motions

@@ -187,7 +187,7 @@ def execute_sequence(
     config: PlanConfig | None = None,
     replan: bool = True,
 ) -> Execution:
-    """Act, observe and plan again until the goal is reached, or so many actions are carried out.
+    """Act, observe and plan again until the goal is reached or ``steps`` actions are carried out.
 
     Args:
         world: Where actions are carried out.
@@ -196,8 +196,8 @@ def execute_sequence(
         imaginer: As of `plan_sequence`.
         context: What it is told.
         config: As of `plan_sequence`.
-        replan: Plan again after each action: one like an earlier one is expected to miss its imagined end by as much.
-            Otherwise the first sequence is carried out as planned, where the object is expected.
+        replan: Plan again after each action, corrected by how far similar earlier actions ended from where they were
+            imagined to; otherwise carry out the first sequence as planned, where the object is expected.
 
     Raises:
         PlanningError: As `plan_sequence`, before the first action; later, a plan that cannot be made ends the
