@@ -163,8 +163,8 @@ def test_plans_for_every_object_are_those_of_each_and_go_on(whole, tmp_path, beg
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--id", "1"], "--id goes with one object"),
-        (["--pose", "0", "0", "0", "--steps", "2"], "--pose and --steps goes with one object"),
+        (["--id", "1"], "many objects: leave out --id, or --every"),
+        (["--pose", "0", "0", "0", "--steps", "2"], "many objects: leave out --pose and --steps, or --every"),
         (["--workers", "0"], "workers is 0"),
     ],
 )

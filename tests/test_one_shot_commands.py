@@ -99,6 +99,13 @@ def test_futures_are_told_in_words(capsys):
     assert said.err.strip() == "foretrace: warning: height 9 cm is unusual"
 
 
+def test_an_object_that_turns_about_no_edge_is_told_without_one(capsys):
+    effect = imagined_effect()
+    nowhere = np.full_like(effect.futures.support_points, np.nan)
+    say_futures(replace(effect, futures=replace(effect.futures, support_points=nowhere)))
+    assert "edge" not in capsys.readouterr().out
+
+
 def test_nobody_says_more_than_is_known(capsys):
     effect = imagined_effect()
     unsure = replace(

@@ -392,7 +392,7 @@ def recorded(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", sorted(VIEWED))
-def test_predictors_learn_from_pushes_that_are_known_at_their_ends(recorded, name):
+def test_predictors_learn_from_pushes_that_are_known_at_their_ends(recorded, name, tmp_path, capsys):
     split = split_by_seed(len(recorded), 0, None)
     training = TrainConfig(epochs=3, min_steps=1, outcomes=OUTCOMES, split=None)
     predictor, _ = fit_predictor(recorded, VIEWED[name], split, training)
@@ -407,6 +407,9 @@ def test_predictors_learn_from_pushes_that_are_known_at_their_ends(recorded, nam
     view = ft.TopDownView.of(PLATE, ft.Push.at_edge(PLATE, 1))
     slow = ft.Push.at_edge(PLATE, 1, path=ft.PushPath(distance=0.03))
     assert predictor.imagine(view, slow).com_trajectory.shape == (2, 3)
+    predictor.save_pretrained(tmp_path / "run")
+    assert main(["predict", str(tmp_path / "run"), "--photo", "a.jpg", "--contact-px", "1", "1"]) == 2
+    assert "--photo goes with lever-ups" in capsys.readouterr().err
 
 
 def test_an_object_relative_to_an_action():

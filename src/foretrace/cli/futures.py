@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from foretrace.cli.console import say
 from foretrace.imagined.shown import LEVEL, in_order, percentage, radius_of
 
@@ -10,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def say_futures(imagined: "ImaginedEffect") -> None:
-    """Print outcomes, support edge and radius; what is unusual goes to the terminal as warnings."""
+    """Print outcomes, support edge if there is one, and radius; what is unusual goes to the terminal as warnings."""
     for warning in imagined.warnings:
         say(f"warning: {warning}")
     futures = imagined.futures
@@ -18,10 +20,12 @@ def say_futures(imagined: "ImaginedEffect") -> None:
         return
     probable = sorted(futures.outcomes().items(), key=lambda item: -item[1][0])
     print("outcome: " + ", ".join(f"{name} {percentage(probability[0])}" for name, probability in probable))
-    (x0, y0), (x1, y1) = 100 * futures.support_points[0, in_order(futures)[0]]
-    print(
-        f"turns about the edge from x {x0:.1f}, y {y0:.1f} to x {x1:.1f}, y {y1:.1f} cm in the action frame"
-    )
+    ends = 100 * futures.support_points[0, in_order(futures)[0]]
+    if np.isfinite(ends).all():
+        (x0, y0), (x1, y1) = ends
+        print(
+            f"turns about the edge from x {x0:.1f}, y {y0:.1f} to x {x1:.1f}, y {y1:.1f} cm in the action frame"
+        )
     radius = radius_of(imagined)
     told = "not known: the validation part was too small" if radius is None else f"{100 * radius[-1]:.2f} cm"
     print(f"radius of the {LEVEL:.0%} region at the end: {told}")

@@ -235,7 +235,7 @@ def _refuse_with_every(obj: ObjectOptions, photo: PhotoOptions, where: PlaceOpti
     one |= {"steps"} if steps != 1 else set()
     if one:
         raise PlanningError(
-            f"{' and '.join(map(_option, sorted(one)))} goes with one object: leave out --every or it"
+            f"--every plans for many objects: leave out {' and '.join(map(_option, sorted(one)))}, or --every"
         )
 
 

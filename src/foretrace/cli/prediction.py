@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from foretrace.actions import LeverUp
 from foretrace.cli.batch import ManyOptions, predict_many
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.example import say_example, write_example
@@ -105,6 +106,10 @@ def predict(
     if photo.photo is not None:
         if replace(obj, height=None) != ObjectOptions() or at != ContactOptions():
             raise PredictionError("--photo shows the object: leave out the other ways, --edge and --contact")
+        if kind is not LeverUp:
+            raise PredictionError(
+                f"--photo goes with lever-ups, {run} predicts a {kind.label}: give --polygon, --image or --mesh"
+            )
         seen = photo.observe(obj.height)
         object, action, view, com = seen.placed.object, seen.action, seen.view, seen.com
     else:
