@@ -222,6 +222,7 @@ def test_missing_credentials_are_told_in_one_line(server, stored, capsys):
             "the server does not answer: check the network, and for S3 AWS_ENDPOINT_URL",
         ),
         ("google::cloud::Status(UNAVAILABLE: Retry policy exhausted)", "the server does not answer"),
+        ("[Errno 111] Connection refused", "the server does not answer"),
         ("google::cloud::Status(UNAVAILABLE: Could not create a OAuth2 access token", "access is denied"),
         ("Something\nelse " + 300 * "x", "Something else xxx"),
     ],

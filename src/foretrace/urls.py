@@ -26,18 +26,18 @@ Result = TypeVar("Result")
 READERS = 16
 """Objects that are read at once."""
 OF_PYARROW = ("s3", "gs", "gcs", "abfs", "abfss", "hdfs", "hf")
-"""Beginnings of URLs that pyarrow reads without another library."""
+"""Schemes of URLs that pyarrow itself reads; for ``hf`` it needs fsspec and huggingface_hub."""
 PATTERN = re.compile(r"([a-z][a-z0-9+.-]+):/+([^?]*)(\?.*)?", re.DOTALL)
-"""Kind, place and settings of a URL; a `Path` of it has lost a slash, and ``C:/`` is a drive."""
+"""Scheme, place and settings of a URL. A `Path` of a URL has lost a slash; ``C:/`` is a drive."""
 REASONS = {
     r"NO_SUCH_BUCKET|bucket does not exist|Bucket '[^']*' not found": "there is no such bucket: make it first",
     r"ACCESS_DENIED|INVALID_ACCESS_KEY|INVALID_CLIENT_TOKEN|SIGNATURE_DOES_NOT_MATCH|HTTP status 40[13]|"
     r"PERMISSION_DENIED|UNAUTHENTICATED|access token|[Cc]redential": "access is denied: give credentials that have it, "
     "for S3 in AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
-    r"NETWORK_CONNECTION|REQUEST_TIMEOUT|UNAVAILABLE|[Cc]ould not connect|[Cc]ouldn't (connect|resolve)": "the server "
-    "does not answer: check the network, and for S3 AWS_ENDPOINT_URL",
+    r"NETWORK_CONNECTION|REQUEST_TIMEOUT|UNAVAILABLE|[Cc]ould not connect|[Cc]ouldn't (connect|resolve)|"
+    r"[Cc]onnection refused": "the server does not answer: check the network, and for S3 AWS_ENDPOINT_URL",
 }
-"""What to say of an error, by what a library says."""
+"""Message and remedy for an error, by what the library's own message contains."""
 LONGEST_REASON = 200
 WAIT = {"gs": "retry_limit_seconds=10", "gcs": "retry_limit_seconds=10"}
 """Settings that bound how long a library tries again, where that is a quarter of an hour."""
@@ -121,18 +121,18 @@ class Url:
         """Names of the files and folders in it, sorted; none where there is no such folder."""
         from pyarrow.fs import FileSelector
 
-        with self._told() as (store, path):
+        with self._opened() as (store, path):
             found = store.get_file_info(FileSelector(path, allow_not_found=True))
         return sorted(each.base_name for each in found if each.base_name)
 
     def read_bytes(self) -> bytes:
         """All bytes of a file."""
-        with self._told() as (store, path), store.open_input_file(path) as file:
+        with self._opened() as (store, path), store.open_input_file(path) as file:
             return file.read()
 
     def write_bytes(self, content: bytes) -> None:
         """Write a file, which appears whole or not at all."""
-        with self._told() as (store, path):
+        with self._opened() as (store, path):
             file = store.open_output_stream(path)
             file.write(content)
             file.close()  # not after an error, which would make a file of what there is
@@ -142,12 +142,12 @@ class Url:
         return BytesIO(self.read_bytes())
 
     def _type(self) -> str:
-        with self._told() as (store, path):
+        with self._opened() as (store, path):
             return store.get_file_info(path).type.name
 
     @contextmanager
-    def _told(self) -> "Iterator[tuple[Any, str]]":
-        """The store, and the path within it; its errors in one line."""
+    def _opened(self) -> "Iterator[tuple[Any, str]]":
+        """The store and the path within it; errors of libraries become errors of foretrace in one line."""
         try:
             bucket, _, key = self.place.partition("/")
             store, root = _store(self.kind, bucket, self.settings)

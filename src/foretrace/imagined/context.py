@@ -33,14 +33,17 @@ SAME = 1e-9
 
 def context_units() -> dict[str, str]:
     """Units of everything that a predictor may be conditioned on: constants, and parameters of all actions' paths."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, dict[str, str]] = {}  # label of the first action with a parameter of that name and unit
     for kind in ACTIONS.values():
         for name in kind.nominal_parameters():
             unit = kind.units.get(name, "in SI units")
-            if all(not other.startswith(unit) for other in found.setdefault(name, [])):
-                found[name].append(f"{unit} ({kind.label})")
-    alone = {name: units[0].rpartition(" (")[0] for name, units in found.items() if len(units) == 1}
-    return CONSTANTS | {name: alone.get(name, ", ".join(units)) for name, units in found.items()}
+            found.setdefault(name, {}).setdefault(unit, kind.label)
+    return CONSTANTS | {
+        name: next(iter(units))
+        if len(units) == 1
+        else ", ".join(f"{unit} ({label})" for unit, label in units.items())
+        for name, units in found.items()
+    }
 
 
 def check_names(names: Sequence[str]) -> tuple[str, ...]:
