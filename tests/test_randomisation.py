@@ -1,6 +1,6 @@
 import json
 from collections import Counter
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -117,6 +117,23 @@ def test_long_and_short_pushes_end_at_the_same_time():
         assert path.duration == pytest.approx(PushPath(distance=0.08).duration)
     with pytest.raises(SimulationError, match="insertion cannot be drawn of a PushPath"):
         replace(drawn, insertion=(0.01, 0.02)).vary(PENTAGON, Physics(), PushPath(), np.random.default_rng(0))
+
+
+@dataclass(frozen=True)
+class OwnPath:
+    """The path of an action of another package."""
+
+    distance: float = 0.06
+
+
+def test_paths_of_other_packages_are_not_drawn(monkeypatch, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    assert RANDOMISED.vary(PENTAGON, Physics(), OwnPath(), rng)[2] == OwnPath()
+    with pytest.raises(SimulationError, match="distance cannot be drawn of a OwnPath: leave it out"):
+        Randomisation(distance=(0.01, 0.02)).vary(PENTAGON, Physics(), OwnPath(), rng)
+    monkeypatch.setattr(LeverUp, "varied", {})
+    assert main(["simulate", "--vary-action", "--out", str(tmp_path / "out")]) == 2
+    assert "and recipe 'paper' has a lever-up: leave it out" in capsys.readouterr().err
 
 
 def test_fast_and_slow_blades_end_at_the_same_time():

@@ -8,10 +8,10 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from foretrace.cli.console import print_outcomes, when_interrupted
 from foretrace.cli.parsing import adapt
-from foretrace.errors import DatasetError
+from foretrace.errors import DatasetError, SimulationError, shown
 from foretrace.simulation.collect import CollectConfig, collect, trial
 from foretrace.simulation.lever_up import SimulationConfig
-from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED
+from foretrace.simulation.randomisation import LARGEST_COM_OFFSET, NOTHING, RANDOMISED, RANGES
 from foretrace.urls import as_place
 from foretrace.workers import on_cluster
 
@@ -54,7 +54,13 @@ def simulate(
         watch_time = 0.0 if config.recipe == "paper" else ROLLING_TIME
     randomisation = RANDOMISED if randomise else NOTHING
     if vary_action:
-        randomisation = replace(randomisation, **type(trial(config, 0)[1]).varied)
+        action = trial(config, 0)[1]
+        if not action.varied or not set(action.varied) <= set(RANGES):
+            raise SimulationError(
+                f"--vary-action varies lever-ups and pushes, and recipe {shown(config.recipe)} has a {action.label}: "
+                "leave it out"
+            )
+        randomisation = replace(randomisation, **action.varied)
     if exact_share:
         randomisation = replace(randomisation, execution_share=1 - exact_share)
     if off_centre:

@@ -5,7 +5,7 @@ on which others vary.
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.objects import Bevel, Box, ObjectModel, Prism, Weighted
 from foretrace.objects.model import inner_radius
 
-Path = TypeVar("Path", ToolPath, PushPath)
+AnyPath = TypeVar("AnyPath")
 Range = tuple[float, float]
 """Least and greatest value of what is drawn uniformly."""
 LARGEST = {
@@ -93,8 +93,8 @@ class Randomisation:
         check_ranges(SimulationError, "randomisation", self, limits)
 
     def vary(
-        self, obj: ObjectModel, physics: Physics, path: Path, rng: np.random.Generator
-    ) -> tuple[ObjectModel, Physics, Path, ExecutionOffset]:
+        self, obj: ObjectModel, physics: Physics, path: AnyPath, rng: np.random.Generator
+    ) -> tuple[ObjectModel, Physics, AnyPath, ExecutionOffset]:
         """One action's object, constants, path and execution error.
 
         Args:
@@ -132,8 +132,9 @@ class Randomisation:
             ExecutionOffset(ahead, left, turn),
         )
 
-    def _drawn_path(self, path: Path, drawn: dict[str, float]) -> Path:
-        if odd := [name for name in drawn if name not in OWN_PATH[type(path)]]:
+    def _drawn_path(self, path: Any, drawn: dict[str, float]) -> Any:
+        """A path of any action with what was drawn of it; one of another package stays as it is."""
+        if odd := [name for name in drawn if name not in OWN_PATH.get(type(path), ())]:
             raise SimulationError(f"{odd[0]} cannot be drawn of a {type(path).__name__}: leave it out")
         if isinstance(path, PushPath):
             if self.distance is None:
