@@ -84,7 +84,7 @@ class Loopback:
         self.address = f"127.0.0.1:{self.port}"
 
     def ensure(self, nodes: int) -> None:
-        """Let so many nodes live."""
+        """Let a number of nodes live."""
         if not list(self.processes("head")):
             self.kill("node")
             begin = f"--head --port={self.port} --include-dashboard=false --temp-dir=/tmp/ray-{self.name}"

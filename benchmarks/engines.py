@@ -232,7 +232,7 @@ def levered_in_both(pairs: list[tuple[Effect, Effect]]) -> list[tuple[Effect, Ef
 
 
 def compare_lever_ups(number: int) -> dict[str, object]:
-    """Every so many of the paper's 2080 trials, with the tool alone."""
+    """Trials of the paper's 2080, evenly spaced, with the tool alone."""
     config = CollectConfig()
     ids = np.linspace(0, num_trials(config) - 1, number).round().astype(int).tolist()
     corners = [len(trial(config, id)[0].corners) for id in ids]

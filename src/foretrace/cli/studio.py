@@ -16,7 +16,7 @@ def studio(
 ) -> None:
     """Try lever-ups in the browser: draw an object, drag the screwdriver round it, plan. Needs foretrace[studio].
 
-    Every visitor has a page of their own. By default nobody but this machine reaches it.
+    Every visitor has a page of their own. By default it can be reached from this machine alone.
 
     With --export nothing is served: a folder is written whose page predicts in the browser, without a server.
 
@@ -55,8 +55,8 @@ def studio(
 def serve(host: str = "127.0.0.1", port: int = 8000) -> None:
     """Serve predictions, plans and monitors over HTTP. Needs foretrace[studio].
 
-    The page at / lists what can be asked, /openapi.json describes it. It asks for no password: by default nobody but
-    this machine reaches it.
+    The page at / lists what can be asked, /openapi.json describes it. It asks for no password: by default it can be
+    reached from this machine alone.
 
     Args:
         host: Address to listen at; 0.0.0.0 lets other machines in, whoever they are.

@@ -223,7 +223,7 @@ def _kept_here(store: Store) -> Experiment:
 
 
 def _threads(threads: int) -> Any:
-    """PyTorch with so many threads, where an experiment has loaded it."""
+    """PyTorch with a number of threads, where an experiment has loaded it."""
     if "torch" not in sys.modules:
         return nullcontext()
     from foretrace.predictor.runtime import thread_count

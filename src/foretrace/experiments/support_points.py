@@ -40,7 +40,7 @@ def support_point_metrics(
         **options: Settings of the feature extractor.
 
     Returns:
-        ``accuracy``: with the object's corners; ``accuracy_3`` and so on: for objects of so many corners;
+        ``accuracy``: with the object's corners; ``accuracy_3`` and so on: for objects with that number of corners;
         ``accuracy_balanced``: the mean of those; ``accuracy_from_mask``: with corners from the mask alone.
 
     Raises:

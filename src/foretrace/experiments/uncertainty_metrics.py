@@ -276,7 +276,7 @@ def evaluate_observed(predictor: OneShotPredictor, part: Part) -> Found:
 def _given(
     predictor: OneShotPredictor, part: Part, rows: Int[np.ndarray, " n"], known: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n time 3"], dict[str, Float[np.ndarray, " n"]]]:
-    """Most probable motions [m] and probabilities of outcomes after so many samples of each were observed."""
+    """Most probable motions [m] and probabilities of outcomes after ``known`` samples of each were observed."""
     com = np.empty((len(rows), *part.com.shape[1:]))
     outcomes = {name: np.empty(len(rows)) for name in predictor.outcomes}
     for number in np.unique(known).tolist():

@@ -19,7 +19,7 @@ def in_order(futures: "Futures") -> list[int]:
 
 
 def radius_of(imagined: "ImaginedEffect") -> np.ndarray | None:
-    """Radius of the region about the path [m]; None where the predictor does not tell, or nobody knows."""
+    """Radius of the region about the path [m]; None where it is not known."""
     radius = imagined.futures.radius(LEVEL)[0, in_order(imagined.futures)[0]]
     return radius if np.isfinite(radius).all() else None
 

@@ -27,7 +27,7 @@ IMPROBABLE = 0.02
 MISSED, PHYSICS, OBJECT = "missed contact", "other physics", "other object"
 """Causes that are imagined in worlds of their own."""
 SHARE = 64
-"""A variant of a cause has one world for so many of the belief's."""
+"""Worlds of the belief for each world of a variant of a cause."""
 FAR_CONTACT, FAR_COM = 0.0075, 0.02
 """Contact error and offset of the centre of mass in these worlds [m]."""
 EIGHT = [(np.cos(angle), np.sin(angle)) for angle in np.pi / 4 * np.arange(8)]

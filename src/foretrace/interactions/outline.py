@@ -16,7 +16,7 @@ CLEARLY = 0.15
 FEW = 3
 """An outline with straight sides may contradict this many pixels."""
 FRAYED = 2
-"""In a noisy mask, it may contradict so many times as many as the level line, which follows some of the noise."""
+"""In a noisy mask, it may contradict this many times the pixels of the level line, which follows some of the noise."""
 MOST_SIDES = 11
 """An outline of more sides is taken to be curved."""
 BLUR = 1.0

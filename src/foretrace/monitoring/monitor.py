@@ -31,11 +31,11 @@ WINDOW = 0.5
 RATE = 6.0
 """Independent observations in a second: residuals that follow each other closely are alike."""
 LARGEST = 7.0
-"""A residual counts for the weights as if it was no more than so many widths."""
+"""Largest residual that counts for the weights, in widths of the band: a larger one counts as this one."""
 LONGEST_GAP = 0.5
 """An object that the tracker loses for longer than this [s] raises an alarm."""
 REPEATS = 3
-"""So many exactly equal samples after the first are a frozen tracker, if a motion is expected meanwhile."""
+"""Exactly equal samples after the first that mean a frozen tracker, if a motion is expected meanwhile."""
 EXPECTED_MOTION = 0.002
 """Motion that is expected at least meanwhile [m]."""
 QUIET = 3e-4

@@ -307,7 +307,7 @@ def sample_prism(rng: np.random.Generator, num_corners: int) -> Prism:
     The circle's centre lies strictly inside: draws with a gap over 165 or under 12 degrees are rejected.
 
     Raises:
-        ShapeError: if so many corners cannot keep their smallest gap, or fewer than three are asked for.
+        ShapeError: The corners are fewer than three, or too many to keep their smallest gap.
     """
     most = int(0.5 * 2 * np.pi / SMALLEST_GAP)
     check_type("rng", rng, np.random.Generator, ShapeError)

@@ -278,7 +278,7 @@ def split_sides(
     tolerance: float,
     blunted: float,
 ) -> tuple[list[int], Float[np.ndarray, "n 2"]]:
-    """Where an outline is best split into so many straight sides, near given indices, and the sides' corners.
+    """Best split of an outline into straight sides, near given indices, and the corners where these sides meet.
 
     Args:
         outline: The outline.

@@ -27,7 +27,7 @@ RADII = (0.012, 0.04)
 LENGTHS = (0.06, 0.20)
 """Smallest and largest length of a sampled cylinder, or long side of a sampled box [m]."""
 SLENDERNESS = 1.25
-"""A sampled solid is at least so many times as long as wide: its long side can be told from its end."""
+"""Least length of a sampled solid over its width: its long side can be told from its end."""
 HEIGHT_RATIOS = (0.5, 1.25)
 """Height of a sampled box over its depth: from lying flat to standing upright without falling over by itself."""
 

@@ -20,7 +20,7 @@ def faces_of(obj: ObjectModel, every: int = 1) -> list[Float[np.ndarray, "_ 3"]]
 
     Args:
         obj: The object.
-        every: Of a cylinder's 64 facets one is made of so many.
+        every: Neighbours among the 64 facets of a cylinder that become one facet.
     """
     obj = obj.shape
     if isinstance(obj, MeshObject):

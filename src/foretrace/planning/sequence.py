@@ -148,7 +148,7 @@ def plan_sequence(
     config: PlanConfig | None = None,
     com: Numbers | None = None,
 ) -> Sequence:
-    """Plan up to so many actions in a row, so that the goal is reached after the last.
+    """Plan up to ``steps`` actions in a row, so that the goal is reached after the last.
 
     All candidates around the outline are imagined once: where an action leaves an object depends on how it acts on the
     object, not on where that lies. Sequences of them are composed from the first on, the best `BEAM` of each length are

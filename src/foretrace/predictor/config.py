@@ -88,7 +88,7 @@ class TrainConfig:
     """Passes over the training part, unless ``min_steps`` asks for more."""
     min_steps: int = 300
     """Optimiser steps, at least: a small training part is passed over more often. On the command line --epochs alone
-    means exactly so many epochs."""
+    means exactly that number of epochs."""
     batch_size: int = 32
     """Trajectories per optimiser step."""
     learning_rate: float = 8e-3

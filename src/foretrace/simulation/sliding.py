@@ -21,7 +21,7 @@ from foretrace.geometry import rotate_plane
 SMOOTHING = 1e-3
 """Feet slower than this share of the rod's speed are smoothed over."""
 FIRST = 4
-"""A push needs so many times more iterations in its first step in contact, or after a change of how it slides."""
+"""Factor on the iterations of a push in its first step in contact, and after a change of how it slides."""
 
 Plane = Float[np.ndarray, "pushes 2"]
 

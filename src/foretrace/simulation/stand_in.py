@@ -231,7 +231,7 @@ class Observation:
     outcome: str
     """What became of the object."""
     perturbation: Perturbation | None
-    """What was different; None: nobody knows."""
+    """What was different; None: not known."""
     physics: Physics = field(default_factory=Physics)
     """Friction and density as they really were."""
 

@@ -41,7 +41,7 @@ FORMAT, VERSION = "foretrace-residual", 1
 CONFIG, MODEL = "residual.json", "residual.safetensors"
 REMEDY = "train the residual again, and save that"
 FEWEST_STEPS = 4
-"""A rate that rises and falls needs at least so many steps."""
+"""Fewest steps over which a learning rate can rise and fall."""
 
 
 class ResidualEntries(TypedDict):

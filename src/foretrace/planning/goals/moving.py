@@ -28,7 +28,7 @@ FARTHEST = 0.3
 LEAST_PROBABLE = 0.01
 """Futures less probable than this enter no zone."""
 STRIDE = 5
-"""Every so many samples an outline is compared with a zone."""
+"""Samples from one comparison of an outline with a zone to the next."""
 
 
 @dataclass(frozen=True)
