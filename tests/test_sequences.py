@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import foretrace as ft
@@ -245,3 +246,19 @@ def test_sequences_that_cannot_be_are_named_in_a_line(name):
     with pytest.raises((PlanningError, TypeError), match=text) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_every_method_of_the_experiment_has_its_bar():
+    from foretrace.experiments import sequences
+
+    rows = pd.DataFrame(
+        [
+            {"kind": "", "number": k, "task": task, "method": method, "reached": k > 0, "actions": 2}
+            | dict.fromkeys(sequences.MEDIANS, 1.0)
+            for task, methods in sequences.METHODS.items()
+            for method in methods
+            for k in range(3)
+        ]
+    )
+    (figure,) = sequences.draw(sequences.summary_of(rows)).values()
+    assert [len(ax.patches) for ax in figure.axes] == [len(each) for each in sequences.METHODS.values()]

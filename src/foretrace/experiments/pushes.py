@@ -22,14 +22,16 @@ from foretrace.experiments.pushes_report import (
     draw_coverage,
     draw_errors,
     draw_poses,
+    means_of,
     report_of,
     summary_of,
     worst_of,
 )
-from foretrace.experiments.pushes_views import VIEWED, answer_from_views
+from foretrace.experiments.pushes_views import VIEWED, ViewedPushes, answer_from_views
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix, rotate_plane
 from foretrace.interactions.pushes import ROD_RADIUS, RecordedPushes, read_pushes
+from foretrace.interactions.pushes_data import end_time
 from foretrace.interactions.record import Physics
 from foretrace.objects import Footed
 from foretrace.simulation.engine import make_engine
@@ -165,7 +167,11 @@ class PushesExperiment(Experiment):
             "rows_left_out": self._read[1],
             "repetitions": repetitions(self._read[0]),
         }
-        return about | {"methods": summary_of(rows), "worst": worst_of(rows)}
+        found = about | {"methods": summary_of(rows), "worst": worst_of(rows)}
+        if rows["method"].isin(list(VIEWED)).any():
+            seen = ViewedPushes(task.test, end_time(task.test)).seen
+            found["viewed"] = means_of(rows[rows["line"].isin(task.test.line[seen])])
+        return found
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """A table of all methods, and one by shape."""

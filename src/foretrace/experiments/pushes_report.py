@@ -50,6 +50,15 @@ def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
     return {str(method): _numbers(part) for method, part in rows.groupby("method", sort=False)}
 
 
+def means_of(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Mean errors of each method on some pushes, and their number."""
+    return {
+        str(method): {name: float(part[name].mean()) for name in ("position_mm", "rotation_deg")}
+        | {"pushes": len(part)}
+        for method, part in rows.groupby("method", sort=False)
+    }
+
+
 def worst_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """The pushes that `SHOWN` errs most on, and what every method makes of them [mm]."""
     errors = rows.pivot_table(index=["line", "shape"], columns="method", values="position_mm", sort=False)
@@ -132,6 +141,17 @@ def report_of(summary: Mapping[str, Any]) -> str:
         f"seed {summary['seed']}. Means with 95 % intervals (bootstrap over pushes).\n",
         markdown_table(head, lines),
     ]
+    if viewed := summary.get("viewed"):
+        text.append(
+            f"\nOf {next(iter(viewed.values()))['pushes']} pushes there is a view: the rod meets the outline and leads "
+            "into the object, which the window holds. Predictors that observe views answer the others as the nominal "
+            "twin does. On those with a view:\n"
+        )
+        lines = [
+            [WORDS.get(name, name), number(each["position_mm"], 2), number(each["rotation_deg"], 2)]
+            for name, each in viewed.items()
+        ]
+        text.append(markdown_table(["Method", "Position [mm]", "Rotation [°]"], lines))
     repeated = summary["repetitions"]
     if repeated["pairs"] >= MANY:
         text.append(

@@ -345,7 +345,13 @@ def draw(summary: Mapping[str, Any]) -> dict[str, Figure]:
     """Success by task and method."""
     if not summary:
         return {}
-    colors = {"identified": GREEN, "nominal": BLUE, "identified, blind": ORANGE, "nominal, blind": GREY}
+    colors = {
+        "identified": GREEN,
+        "several worlds": GREEN,
+        "nominal": BLUE,
+        "identified, blind": ORANGE,
+        "nominal, blind": GREY,
+    }
     fig = new_figure(9.0, 3.8)
     axes = np.ravel(fig.subplots(1, len(summary), sharey=True, squeeze=False))
     for ax, (task, found) in zip(axes, summary.items(), strict=True):
@@ -354,7 +360,7 @@ def draw(summary: Mapping[str, Any]) -> dict[str, Figure]:
             ax.bar(k, success["mean"], color=colors[method], width=0.7)
             ax.plot([k, k], [success["low"], success["high"]], color=INK, linewidth=1.2)
             ax.text(k, success["high"] + 2, f"{success['mean']:.0f}", ha="center", fontsize=8.5)
-        ax.set_xticks(range(len(found)), [name.replace(", ", ",\n") for name in found], fontsize=7.5)
+        ax.set_xticks(range(len(found)), [name.replace(" ", "\n") for name in found], fontsize=7.5)
         count = next(iter(found.values()))["episodes"]
         grid(ax, title=f"{task}, {count} objects", ylim=(0, 112))
     axes[0].set_ylabel("goal reached [%]")
