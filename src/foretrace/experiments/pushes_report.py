@@ -47,16 +47,19 @@ MANY_WORST = 20
 
 def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Errors and coverage of each method."""
-    return {str(method): _numbers(part) for method, part in rows.groupby("method", sort=False)}
+    return {method: _numbers(part) for method, part in _by_method(rows)}
 
 
-def means_of(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Mean errors of each method on some pushes, and their number."""
-    return {
-        str(method): {name: float(part[name].mean()) for name in ("position_mm", "rotation_deg")}
-        | {"pushes": len(part)}
-        for method, part in rows.groupby("method", sort=False)
-    }
+def means_of(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Mean errors of each method on some pushes with their intervals, and their number."""
+    return {method: _errors(part) | {"pushes": len(part)} for method, part in _by_method(rows)}
+
+
+def _by_method(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """The rows of each method, in the order of `WORDS`; others come first."""
+    places = {name: k for k, name in enumerate(WORDS)}
+    parts = [(str(name), part) for name, part in rows.groupby("method", sort=False)]
+    return sorted(parts, key=lambda each: places.get(each[0], -1))
 
 
 def worst_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -72,21 +75,24 @@ def worst_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _numbers(part: pd.DataFrame) -> dict[str, Any]:
-    found: dict[str, Any] = {"pushes": len(part)}
+    found = {"pushes": len(part)} | _errors(part)
     for name in ("position_mm", "rotation_deg"):
-        values = part[name].to_numpy(float)
-        found[name] = float(values.mean())
-        found[f"{name}_interval"] = _interval(values)
-        found[f"{name}_median"] = float(np.median(values))
+        found[f"{name}_median"] = float(np.median(part[name].to_numpy(float)))
     found["coverage"] = _coverage(part)
     for column, name in (("shape", "by_shape"), ("speed_mm_s", "by_speed")):
         found[name] = {
-            str(key): {
-                each: float(some[each].to_numpy(float).mean()) for each in ("position_mm", "rotation_deg")
-            }
-            | {"pushes": len(some), "coverage": _coverage(some)}
+            str(key): _errors(some) | {"pushes": len(some), "coverage": _coverage(some)}
             for key, some in part.groupby(column)
         }
+    return found
+
+
+def _errors(part: pd.DataFrame) -> dict[str, Any]:
+    """Means of both errors with their intervals."""
+    found: dict[str, Any] = {}
+    for name in ("position_mm", "rotation_deg"):
+        values = part[name].to_numpy(float)
+        found |= {name: float(values.mean()), f"{name}_interval": _interval(values)}
     return found
 
 
@@ -148,7 +154,7 @@ def report_of(summary: Mapping[str, Any]) -> str:
             "twin does. On those with a view:\n"
         )
         lines = [
-            [WORDS.get(name, name), number(each["position_mm"], 2), number(each["rotation_deg"], 2)]
+            [WORDS.get(name, name), _with_interval(each, "position_mm"), _with_interval(each, "rotation_deg")]
             for name, each in viewed.items()
         ]
         text.append(markdown_table(["Method", "Position [mm]", "Rotation [°]"], lines))
@@ -166,6 +172,20 @@ def report_of(summary: Mapping[str, Any]) -> str:
         for name, each in methods.items()
     ]
     text += ["\n## By shape\n", "Position [mm] / rotation [°].\n", markdown_table(["Method", *shapes], parts)]
+    if SHOWN in methods:
+        groups = [(name, key) for name in ("by_shape", "by_speed") for key in methods[SHOWN][name]]
+        rows = [
+            [
+                key if name == "by_shape" else f"{float(key):g} mm/s",
+                str(each["pushes"]),
+                _with_interval(each, "position_mm"),
+                _with_interval(each, "rotation_deg"),
+            ]
+            for name, key in groups
+            for each in [methods[SHOWN][name][key]]
+        ]
+        head = ["Shape or speed", "Pushes", "Position [mm]", "Rotation [°]"]
+        text += [f"\nThe {WORDS[SHOWN]}, with 95 % intervals:\n", markdown_table(head, rows)]
     if worst := summary["worst"]:
         columns = list(worst[0]["position_mm"])
         listed = [
