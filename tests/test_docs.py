@@ -11,6 +11,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -19,6 +20,7 @@ import pytest
 import trimesh
 
 from foretrace import cli
+from foretrace.extras import MissingExtraError
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.motions import read_recordings
 from foretrace.objects import object_from_dict
@@ -132,7 +134,8 @@ def test_snippets_that_are_not_run_can_be_read(page: Path) -> None:
         elif snippet.reason:
             for program, *arguments in snippet.commands():
                 if program == "foretrace":
-                    cli.read(arguments)
+                    with suppress(MissingExtraError):  # warp is in no development environment
+                        cli.read(arguments)
 
 
 @pytest.mark.parametrize(

@@ -474,5 +474,5 @@ def test_the_calibration_that_comes_along():
     worlds, futures = (MonitorCalibration.shipped(kind) for kind in ("worlds", "futures"))
     assert worlds.executions >= 100
     assert 1 < worlds.threshold(0.05) < futures.threshold(0.05)
-    with pytest.raises(MonitoringError, match="choose from worlds, futures"):
+    with pytest.raises(MonitoringError, match="only for worlds, futures, push worlds"):
         MonitorCalibration.shipped("plans")

@@ -238,7 +238,7 @@ def test_the_command_on_the_card_asks_for_the_same_training(card: str, run: Path
     asked = []
     monkeypatch.setattr(
         "foretrace.predictor.train_predictor",
-        lambda data, config, out, training, **_: asked.append((config, training)),
+        lambda data, config, out, training, **_: asked.append((config, training)) or out,
     )
     command = re.search(r"^\$ foretrace (train .*)$", card, re.MULTILINE)
     assert command is not None

@@ -127,7 +127,8 @@ def test_a_set_in_a_store_reads_as_one_in_a_folder(stored, folder, large, monkey
     monkeypatch.setattr(datasets, "CACHE_BYTES", 0 if large else 2**30)
     there = Dataset.open(Path("s3://bucket/stored/set"))  # which has lost a slash
     assert there.path == stored
-    assert there.index.equals(here.index)
+    # A large set keeps more in its index, and items of lists may have other names.
+    assert there.index.select(here.index.column_names).to_pydict() == here.index.to_pydict()
     assert there.table.equals(here.table)
     np.testing.assert_array_equal(there[7].effect.pose_trajectory, here[7].effect.pose_trajectory)
     read.clear()

@@ -64,6 +64,7 @@ class PlanConfig:
                 raise PlanningError(f"{name} is {shown(value)}: give a whole number from {least} to {most}")
         if not is_whole(self.seed, 0, 2**63 - 1):
             raise PlanningError(f"seed is {shown(self.seed)}: give a whole number from 0 to {2**63 - 1}")
+        check_type("vary_path", self.vary_path, (bool, type(None)), PlanningError)
         limits = {"spacing": (0.001, 0.1), "tail": (0.001, 1.0)}
         limits |= {} if self.cone is None else {"cone": (0.0, 0.8)}
         check_ranges(PlanningError, "plan", self, limits)

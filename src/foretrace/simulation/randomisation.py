@@ -110,7 +110,9 @@ class Randomisation:
         """
         # Numbers of its own, which do not move those of other settings.
         (own,) = rng.spawn(1)
-        shares = dict(zip((field.name for field in fields(self)), rng.random(len(fields(self))), strict=True))
+        names = [field.name for field in fields(self) if field.name != "distance"]
+        shares = dict(zip(names, rng.random(len(names)), strict=True))
+        shares["distance"] = own.spawn(1)[0].random()  # a later setting, which moves no other's numbers
         drawn = {
             name: float(limits[0] + shares[name] * (limits[1] - limits[0]))
             for name in RANGES
