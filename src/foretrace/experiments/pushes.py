@@ -168,9 +168,9 @@ class PushesExperiment(Experiment):
             "repetitions": repetitions(self._read[0]),
         }
         found = about | {"methods": summary_of(rows), "worst": worst_of(rows)}
-        if rows["method"].isin(list(VIEWED)).any():
+        if set(VIEWED) & set(rows["method"].to_list()):
             seen = ViewedPushes(task.test, end_time(task.test)).seen
-            found["viewed"] = means_of(rows[rows["line"].isin(task.test.line[seen])])
+            found["viewed"] = means_of(rows.loc[np.isin(rows["line"].to_numpy(), task.test.line[seen])])
         return found
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
