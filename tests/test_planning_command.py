@@ -73,7 +73,7 @@ def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert run(f"{command} --friction 0.5") == 2
     assert "--friction: the sliding twin imaginer is not conditioned on it" in capsys.readouterr().err
     assert run(f"{command} somewhere") == 2
-    assert "somewhere learned single lever-ups: leave it out" in capsys.readouterr().err
+    assert "somewhere imagines its own action, once: leave it out" in capsys.readouterr().err
 
 
 def test_a_plan_leaves_no_sequence_of_an_earlier_one(files: Path) -> None:

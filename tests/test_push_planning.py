@@ -49,9 +49,10 @@ def test_an_imagined_push_is_that_of_the_quasi_static_model(fraction):
 
 def test_regions_hold_pushes_that_were_carried_out(tmp_path):
     """Known at their ends alone, and pushed farther and less exactly than the twin says."""
-    pushes = read_pushes(*write_push_table(tmp_path, 120, farther=0.002, noise=0.002))[0]
-    twin = ft.SlidingTwin(steps=8).calibrated(pushes[:60])
-    end, rows = end_time(pushes), range(60, 120)
+    pushes = read_pushes(*write_push_table(tmp_path, 260, farther=0.002, noise=0.002))[0]
+    order = np.random.default_rng(0).permutation(len(pushes))
+    twin = ft.SlidingTwin(steps=8).calibrated(pushes[order[60:]])
+    end, rows = end_time(pushes), order[:60].tolist()
     held = []
     for made in (push_interaction(pushes, row, end, row) for row in rows):
         if made is None:

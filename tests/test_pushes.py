@@ -26,7 +26,8 @@ from foretrace.experiments.pushes import repetitions, split_pushes
 from foretrace.experiments.pushes_views import OUTCOMES, VIEWED, answer_from_views
 from foretrace.features.action_frame import PROBES, RAYS, find_action_frame
 from foretrace.geometry import quaternion_to_matrix
-from foretrace.interactions.pushes import read_pushes
+from foretrace.interactions.pushes import RecordedPushes, read_pushes
+from foretrace.interactions.pushes_data import push_interaction
 from foretrace.interactions.splits import split_by_seed
 from foretrace.objects import FOOTINGS, NO_BEVEL, Footed, HullShape, Prism, object_from_dict
 from foretrace.predictor import TrainConfig, fit_predictor
@@ -346,6 +347,46 @@ def test_a_rod_that_starts_inside_the_object_is_refused():
         ActionError, match=r"the rod starts \d+\.\d mm inside the object: give a direction into it"
     ):
         ft.simulate(PLATE, ft.Push((-SIDE / 2, 0), (-1, 0)), embodiment="tool")
+
+
+def test_pushes_that_cannot_be_are_refused_or_left_out(tmp_path):
+    with pytest.raises(ActionError, match=r"the rod moves by 0 m: give 0\.0005 m or more"):
+        ft.PushPath(distance=0.05, approach=-0.05)
+    for settings in ({"steps": 0}, {"seed": -1}, {"shared": np.full(9, np.nan)}):
+        with pytest.raises(PredictionError, match="give whole numbers from 1 and from 0"):
+            SlidingTwin(**settings)
+    with pytest.raises(DatasetError, match="give at least one push"):
+        RecordedPushes.of([])
+    table, shapes = write_push_table(tmp_path, 30)
+    pushes = read_pushes(table, shapes)[0]
+    ahead = pushes.motion / np.linalg.norm(pushes.motion, axis=1)[:, None]
+    far = replace(pushes, rod=pushes.rod + np.stack([-0.15 * ahead, 0 * ahead], axis=1))
+    assert far.action(0) is None  # it starts 15 cm away
+    assert push_interaction(replace(pushes, speed=np.full(30, 0.0005)), 0, 100.0, 0) is None
+    text = table.read_text().splitlines()
+    cells, names = text[1].split(","), text[0].split(",")
+    cells[names.index("x1")] = "5.0"
+    thrown = _file(tmp_path / "thrown.csv", "\n".join([text[0], ",".join(cells), *text[2:]]))
+    with pytest.raises(DatasetError, match=r"line 2: the object moves by 4\.9 m, the rod by 0\.0\d+ m"):
+        read_pushes(thrown, shapes)
+
+
+def test_regions_are_those_of_the_constants_that_are_played(tmp_path):
+    """Constants of a shape count in a twin of that shape alone."""
+    truth = np.array([0.4, -0.4, -0.4, 0, 0, 0, 0, 1.0, 0.0])
+    pushes = read_pushes(*write_push_table(tmp_path, 30, constants=truth, noise=1e-4))[0]
+    shape = pushes.shapes[pushes.shape[0]].name
+    own = pushes[np.flatnonzero(pushes.shape == pushes.shape[0])]
+    twin = SlidingTwin(own={(pushes.surface[0], shape): truth})
+    shared, exact = (
+        twin.calibrated(own).errors,
+        twin.of_shape(pushes.surface[0], shape).calibrated(own).errors,
+    )
+    assert shared is not None
+    assert exact is not None
+    assert np.median(exact) < 0.3 * np.median(shared)
+    coarse = replace(SlidingTwin(), steps=2).calibrated(own).errors
+    assert np.abs(coarse - SlidingTwin().calibrated(own).errors).max() > 1e-5
 
 
 def test_names_that_look_like_numbers_and_strange_tables(tmp_path):

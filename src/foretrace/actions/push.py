@@ -25,6 +25,8 @@ LOST_GAP = 0.0015
 """A rod that ends farther than this from the object has lost it [m]."""
 DEEPEST = 0.002
 """A rod that starts farther inside an object than this is refused [m]."""
+SHORTEST = 0.0005
+"""Shortest motion of a rod [m]."""
 RAMP = 0.05
 """Time in which the rod gains or loses its speed [s]."""
 
@@ -85,6 +87,11 @@ class PushPath:
             "hold_time": (0.0, 60.0),
         }
         check_ranges(ActionError, "push path", self, limits)
+        if self.length < SHORTEST:
+            raise ActionError(
+                f"push path: with approach = {self.approach:g} and distance = {self.distance:g} the rod moves by "
+                f"{self.length:g} m: give {SHORTEST:g} m or more"
+            )
 
     @property
     def length(self) -> float:

@@ -242,7 +242,9 @@ def _refuse_with_every(obj: ObjectOptions, photo: PhotoOptions, where: PlaceOpti
 def imaginer_of(run: Path | None, action: ActionName, steps: int) -> "Imaginer":
     """What imagines actions of a kind, to rest if there are several."""
     if run is not None and (action == "push" or steps != 1):
-        raise PlanningError(f"{run} learned single lever-ups: leave it out, or --action push and --steps")
+        raise PlanningError(
+            f"{run} imagines its own action, once: leave it out, or --action push and --steps"
+        )
     if action == "push":
         from foretrace.twin.sliding import SlidingTwin
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from msgspec import Meta
 
 from foretrace.actions import FAILED, Push, PushOutcome, PushPath, Rod
-from foretrace.errors import DatasetError, ShapeError, is_number, shown
+from foretrace.errors import ActionError, DatasetError, ShapeError, check_type, is_number, shown
 from foretrace.files import read_json
 from foretrace.geometry import invert_transform, pose_to_matrix, rotate_plane, wrap_angle
 from foretrace.interactions.record import Interaction
@@ -43,6 +43,8 @@ SHORTEST = 0.001
 """A rod that moves by less pushes nothing [m]."""
 MOST_LISTED = 5
 """Rows that a message names."""
+THROWN = 0.1
+"""An object that is moved farther than the rod by more than this was not pushed by it [m]."""
 STEPS = 200
 """Places along the rod's path at which it may first touch the object."""
 TOUCH = 1e-4
@@ -162,6 +164,7 @@ class RecordedPushes:
         shapes: list[PushedShape] = []
         numbers, after, rods = [], [], []
         for each in interactions:
+            check_type("an interaction", each, Interaction, DatasetError)
             action, effect = each.action, each.effect
             if not isinstance(action, Push) or effect.outcome in (FAILED, PushOutcome.TIPPED):
                 raise DatasetError(
@@ -182,6 +185,8 @@ class RecordedPushes:
             numbers.append(number)
             after.append([*moved[:2, 3], np.arctan2(moved[1, 0], moved[0, 0])])
             rods.append([start, start + action.path.length * action.direction])
+        if not numbers:
+            raise DatasetError("there are no interactions: give at least one push")
         radii = {each.action.tool.radius for each in interactions}  # pyright: ignore[reportAttributeAccessIssue]
         if len(radii) != 1:
             raise DatasetError(
@@ -195,7 +200,10 @@ class RecordedPushes:
         )  # fmt: skip
 
     def action(self, row: int) -> Push | None:
-        """The push of a row, placed on its object; None where the rod passes the object without touching it."""
+        """The push of a row, placed on its object; None where the rod passes the object or hardly touches it.
+
+        None, too, where its path is out of the range of paths: it starts too far away, or is too slow or too long.
+        """
         start, motion = self[[row]].start[0], self[[row]].motion[0]
         length = float(np.linalg.norm(motion))
         direction = motion / length
@@ -216,7 +224,10 @@ class RecordedPushes:
             meets = float(((crossed - start) @ direction).min())
             ahead = meets if meets - ahead < 3 * self.radius else ahead
         approach = ahead - self.radius
-        path = PushPath(distance=length - approach, approach=approach, speed=float(self.speed[row]))
+        try:
+            path = PushPath(distance=length - approach, approach=approach, speed=float(self.speed[row]))
+        except ActionError:
+            return None
         return Push(start + ahead * direction, direction, path, Rod(radius=self.radius))
 
 
@@ -367,6 +378,10 @@ def _find_faults(pushes: RecordedPushes, faults: dict[int, str]) -> None:
             faults[row] = f"speed_mm_s is {1000 * pushes.speed[row]:g}: give {SLOWEST:g} to {FASTEST:g} mm/s"
         elif length[row] < SHORTEST:
             faults[row] = f"the rod moves by {1000 * length[row]:.2g} mm: it pushes nothing"
+        elif (moved := np.linalg.norm(np.diff(places[row, :4].reshape(2, 2), axis=0))) > length[row] + THROWN:
+            faults[row] = (
+                f"the object moves by {moved:.2g} m, the rod by {length[row]:.2g} m: are its poses in one frame?"
+            )
         elif first != row:
             faults[row] = f"repeats line {pushes.line[first]}"
         elif gaps[row] < -DEEPEST:

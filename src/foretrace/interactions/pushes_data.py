@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from foretrace.actions import Motion
-from foretrace.errors import DatasetError, ViewError
+from foretrace.errors import ActionError, DatasetError, ViewError
 from foretrace.files import first_stranger, make_folder, sole_writer, versions_of
 from foretrace.geometry import matrix_to_pose, planar_transform, quaternion_to_matrix
 from foretrace.interactions import storage
@@ -32,7 +32,9 @@ def end_time(pushes: RecordedPushes) -> float:
 
 
 def push_interaction(pushes: RecordedPushes, row: int, end: float, id: int) -> Interaction | None:
-    """The interaction of one recorded push; None where the rod passes the object, or the object leaves the view.
+    """The interaction of one recorded push; None where it can have none.
+
+    It has none where the rod passes the object, the object leaves the view, or the path is out of its range.
 
     Args:
         pushes: The pushes.
@@ -48,7 +50,10 @@ def push_interaction(pushes: RecordedPushes, row: int, end: float, id: int) -> I
     except ViewError:
         return None
     path = action.path
-    action = replace(action, path=replace(path, hold_time=path.hold_time + end - path.duration))
+    try:
+        action = replace(action, path=replace(path, hold_time=path.hold_time + end - path.duration))
+    except ActionError:
+        return None
     shape = pushes.shapes[pushes.shape[row]]
     x, y, turn = pushes[[row]].displacement()[0]
     rest = action.T_action_object

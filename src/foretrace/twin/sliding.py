@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from foretrace.actions import Push
-from foretrace.errors import ActionError, PredictionError, is_number, is_whole, shown
+from foretrace.errors import ActionError, PredictionError, check_type, is_number, is_whole, shown
 from foretrace.geometry import invert_transform, rotate_plane
 from foretrace.imagined import ImaginedBatch, Imaginer, Scenes
 from foretrace.imagined.context import EXACT
@@ -110,6 +110,12 @@ class SlidingTwin(Imaginer):
     rests = True
 
     def __post_init__(self) -> None:
+        shared = np.shape(self.shared) == (len(NAMES),) and np.isfinite(self.shared).all()
+        if not is_whole(self.steps, 1, 10_000) or not is_whole(self.seed, 0, 2**63 - 1) or not shared:
+            raise PredictionError(
+                f"steps is {shown(self.steps)}, seed {shown(self.seed)}, shared {shown(self.shared)}: give whole "
+                f"numbers from 1 and from 0, and {len(NAMES)} finite values"
+            )
         fits = is_number(self.duration) and 0.5 <= self.duration <= 600
         if not fits or not is_whole(self.worlds, 2, 65536):
             raise PredictionError(
@@ -280,16 +286,23 @@ class SlidingTwin(Imaginer):
         return push
 
     def predict(self, pushes: RecordedPushes, change: Change = Change()) -> Float[np.ndarray, "pushes 3"]:
-        """Displacement [m] and turn [rad] of each object, in its own frame at rest."""
+        """Displacement [m] and turn [rad] of each object, in its own frame at rest.
+
+        Raises:
+            PredictionError: What is given are no `RecordedPushes`.
+        """
+        check_pushes(pushes)
         found = np.zeros((len(pushes), 3))
         for group, rows in groups_of(pushes).items():
-            found[rows] = _play(pushes[rows], self.own.get(group, self.shared)[None], change)[0]
+            found[rows] = _play(pushes[rows], self.own.get(group, self.shared)[None], change, self.steps)[0]
         return found
 
     def calibrated(self, pushes: RecordedPushes) -> "SlidingTwin":
         """The twin with regions that as many of such pushes hold as they say (split-conformal), where all is told.
 
-        Pushes may be known at their ends alone: before its end, a motion's region is narrower as it has come less far.
+        What counts is how they differ from what `imagine` plays: by the constants that all shapes share, or those of
+        one shape in a twin `of_shape`. Pushes may be known at their ends alone: before its end, a motion's region is
+        narrower as it has come less far.
 
         Args:
             pushes: Pushes that were carried out, none of those that the constants were identified from.
@@ -297,12 +310,13 @@ class SlidingTwin(Imaginer):
         Raises:
             PredictionError: There are no pushes.
         """
+        check_pushes(pushes)
         if len(pushes) == 0:
-            raise PredictionError("no push to calibrate with: give at least twenty")
+            raise PredictionError("no push to calibrate with: give at least one, better a hundred")
         centre = np.array([shape.centroid for shape in pushes.shapes])[pushes.shape]
         ends = [
             moved[:, :2] + rotate_plane(centre, moved[:, 2])
-            for moved in (self.predict(pushes), pushes.displacement())
+            for moved in (replace(self, own={}).predict(pushes), pushes.displacement())
         ]
         return replace(self, errors=np.linalg.norm(ends[0] - ends[1], axis=1))
 
@@ -315,8 +329,11 @@ class SlidingTwin(Imaginer):
             seed: Decides which pushes are used where there are more than `MOST_FITTED` of a shape.
 
         Raises:
-            PredictionError: There are no pushes.
+            PredictionError: There are no pushes, or the seed is no whole number from 0.
         """
+        check_pushes(pushes)
+        if not is_whole(seed, 0, 2**63 - 1):
+            raise PredictionError(f"seed is {shown(seed)}: give a whole number from 0")
         if len(pushes) == 0:
             raise PredictionError("no push to identify constants from: give at least one")
         rng = np.random.default_rng(seed)
@@ -337,6 +354,17 @@ def _axes(scenes: Scenes, rows: np.ndarray) -> Float[np.ndarray, "rows 2 2"]:
     return np.array([scenes.actions[row].T_action_object[:2, :2].T for row in rows])
 
 
+def check_pushes(pushes: RecordedPushes) -> None:
+    """Refuse what is no table of pushes.
+
+    Raises:
+        PredictionError: It is something else, such as interactions.
+    """
+    check_type(
+        "pushes", pushes, RecordedPushes, PredictionError, "RecordedPushes, as of(interactions) makes them"
+    )
+
+
 def groups_of(pushes: RecordedPushes) -> dict[Group, np.ndarray]:
     """Rows of each shape on each surface."""
     keys = [(pushes.surface[k], pushes.shapes[pushes.shape[k]].name) for k in range(len(pushes))]
@@ -344,7 +372,10 @@ def groups_of(pushes: RecordedPushes) -> dict[Group, np.ndarray]:
 
 
 def _play(
-    pushes: RecordedPushes, values: Float[np.ndarray, "variants names"], change: Change = Change()
+    pushes: RecordedPushes,
+    values: Float[np.ndarray, "variants names"],
+    change: Change = Change(),
+    steps: int | None = None,
 ) -> Float[np.ndarray, "variants pushes 3"]:
     """Displacements and turns of pushes of one shape, by several sets of constants."""
     shape, variants, count = pushes.shapes[pushes.shape[0]], len(values), len(pushes)
@@ -362,7 +393,7 @@ def _play(
         np.tile(motion, (variants, 1)),
         pushes.radius,
         np.repeat(FRICTION * np.exp(values[:, 0]) * change.friction, count),
-        STEPS,
+        steps or STEPS,
     )
     origin = np.repeat(offset[:, 0], count, axis=0)
     moved = position + origin - rotate_plane(origin, angle)
