@@ -262,3 +262,18 @@ def test_every_method_of_the_experiment_has_its_bar():
     )
     (figure,) = sequences.draw(sequences.summary_of(rows)).values()
     assert [len(ax.patches) for ax in figure.axes] == [len(each) for each in sequences.METHODS.values()]
+
+
+def test_lessons_are_about_what_was_imagined(monkeypatch):
+    """Not about what was expected after earlier lessons: then a second one would deny the first."""
+    learned = []
+    monkeypatch.setattr(
+        "foretrace.planning.sequence.taught",
+        lambda motions, lessons: learned.append(lessons) or taught(motions, lessons),
+    )
+    goal = ft.goals.MoveTo((0.2, 0.0), tolerance=0.01)
+    config = replace(QUICK, refine=0, directions=1, vary_path=False)
+    found = execute_sequence(Moved(0.05), goal, 4, TWIN, config=config)
+    errors = [lesson.error for lesson in max(learned, key=len)]
+    assert len(errors) == len(found.actions) - 1 >= 2
+    np.testing.assert_allclose(errors, [[0.0, 0.0, 0.05]] * len(errors), atol=1e-9)

@@ -21,7 +21,7 @@ from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
 from foretrace.planning.goals import Goal, as_goal, describe
 from foretrace.planning.goals.base import LEVERED
-from foretrace.planning.lessons import Lesson
+from foretrace.planning.lessons import Lesson, taught
 from foretrace.planning.motions import Motions
 from foretrace.planning.plan import PlanConfig
 from foretrace.planning.result import Plan
@@ -236,8 +236,9 @@ def execute_sequence(
         actions.append(action)
         frames.append(T_start_table @ _located(world))
         if replan:
-            moved = (invert_transform(a) @ b for a, b in (sequences[-1].frames[:2], frames[-2:]))
-            lessons.append(Lesson.of(action, *moved))
+            # Against what was imagined: what was expected after earlier lessons would count these twice.
+            imagined = _first_motion(sequences[-1].plan, scene).resting_frames()[0][0]
+            lessons.append(Lesson.of(action, imagined, invert_transform(frames[-2]) @ frames[-1]))
         state = _state(aim, scene, com, frames[-1], outcomes[-1])
     return Execution(
         tuple(actions), tuple(outcomes), np.array(frames), tuple(sequences), bool(state[1]), float(state[0])
@@ -311,9 +312,7 @@ def _plan(
     if len(rows) < 2:
         plan = search.finish(pool, scores)
         actions, cost, reached = (plan.action,), plan.cost, plan.reached
-        effect = plan.imagined
-        batch = ImaginedBatch(effect.times, effect.com_trajectory[None], None, effect.futures)
-        moved = Motions.of(batch, actions, scene.outline, scene.height, whole=True).resting_frames()[0]
+        moved = taught(_first_motion(plan, scene), search.lessons).resting_frames()[0]
     else:
         plan = search.finish(pool, scores, chosen=int(rows[0]))
         actions, moved = tuple(around.actions[k] for k in rows), search.around.resting_frames()[0][rows]
@@ -325,6 +324,13 @@ def _plan(
         several = "one action does" if steps == 1 else f"{steps} actions do"
         note = f"{several} not reach the goal {describe(aim)}: this comes nearest, with a probability of {reached:.0%}"
     return Sequence(plan, actions, np.array(frames), cost, reached, describe(aim), note), search
+
+
+def _first_motion(plan: Plan, scene: Scene) -> Motions:
+    """What is imagined of a plan's action, until the object rests."""
+    effect = plan.imagined
+    batch = ImaginedBatch(effect.times, effect.com_trajectory[None], None, effect.futures)
+    return Motions.of(batch, (plan.action,), scene.outline, scene.height, whole=True)
 
 
 def _compose(
