@@ -10,7 +10,8 @@ from foretrace.interactions.pushes import read_pushes
 from foretrace.interactions.pushes_data import end_time, push_interaction
 from foretrace.objects import NO_BEVEL
 from foretrace.simulation.sliding import Footprint, slide, slide_along
-from foretrace.twin.sliding import NAMES, SlidingTwin
+from foretrace.twin.sliding import SlidingTwin
+from foretrace.twin.sliding_constants import NAMES
 
 SIDE = 0.09
 PLATE = ft.Prism(SIDE / 2 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]), 0.013, NO_BEVEL)

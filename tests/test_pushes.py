@@ -32,8 +32,9 @@ from foretrace.interactions.splits import split_by_seed
 from foretrace.objects import FOOTINGS, NO_BEVEL, Footed, HullShape, Prism, object_from_dict
 from foretrace.predictor import TrainConfig, fit_predictor
 from foretrace.simulation.sliding import Footprint, slide
-from foretrace.twin import sliding
-from foretrace.twin.sliding import Change, SlidingTwin
+from foretrace.twin import sliding_constants
+from foretrace.twin.sliding import SlidingTwin
+from foretrace.twin.sliding_constants import Change
 from foretrace.twin.sliding_residual import PushRegions, PushResidual, push_errors
 
 SIDE = 0.09
@@ -151,8 +152,8 @@ def test_quasi_static_pushes_agree_with_mujoco():
 
 
 def test_constants_are_identified_from_pushes(tmp_path, monkeypatch):
-    monkeypatch.setattr(sliding, "ITERATIONS", 3)
-    monkeypatch.setattr(sliding, "STEPS", 15)
+    monkeypatch.setattr(sliding_constants, "ITERATIONS", 3)
+    monkeypatch.setattr(sliding_constants, "STEPS", 15)
     truth = np.array([0.4, -0.4, -0.4, 0, 0, 0, 0, 1.0, 0.0])
     pushes = read_pushes(*write_push_table(tmp_path, 30, constants=truth, noise=1e-4))[0]
     found = SlidingTwin.identified(pushes)

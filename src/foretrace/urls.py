@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from foretrace.errors import DatasetError, ForetraceError, shown, wrong_type
 from foretrace.extras import named_extras
@@ -137,7 +137,7 @@ class Url:
             file.write(content)
             file.close()  # not after an error, which would make a file of what there is
 
-    def open(self, mode: str = "rb") -> BytesIO:
+    def open(self, mode: Literal["rb"] = "rb") -> BytesIO:
         """A file in memory, to be read."""
         return BytesIO(self.read_bytes())
 

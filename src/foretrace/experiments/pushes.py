@@ -35,7 +35,8 @@ from foretrace.interactions.pushes_data import end_time
 from foretrace.interactions.record import Physics
 from foretrace.objects import Footed
 from foretrace.simulation.engine import make_engine
-from foretrace.twin.sliding import FRICTION, SlidingTwin
+from foretrace.twin.sliding import SlidingTwin
+from foretrace.twin.sliding_constants import FRICTION
 from foretrace.twin.sliding_residual import FEWEST, PushRegions, PushResidual, push_errors
 
 MOST_TESTED = 1000

@@ -1,9 +1,4 @@
-"""A twin of planar pushes: the quasi-static model, with constants that are identified from recorded pushes.
-
-The constants are the rod's friction, how an object's weight is spread over its lower face, and offsets between the
-frames of object, rod and table. Every constant has a prior: few pushes suffice for those that all shapes share, each
-shape's own need more.
-"""
+"""A twin of planar pushes: the quasi-static model, with constants that are identified from recorded pushes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from foretrace.actions import Push
-from foretrace.errors import ActionError, PredictionError, check_type, is_number, is_whole, shown
+from foretrace.errors import ActionError, PredictionError, is_number, is_whole, shown
 from foretrace.geometry import invert_transform, rotate_plane
 from foretrace.imagined import ImaginedBatch, Imaginer, Scenes
 from foretrace.imagined.context import EXACT
@@ -21,56 +16,29 @@ from foretrace.interactions.pushes import RecordedPushes
 from foretrace.objects import ObjectModel
 from foretrace.objects.footed import feet_of
 from foretrace.simulation.randomisation import RANDOMISED
-from foretrace.simulation.sliding import Footprint, slide
 from foretrace.twin.outline import SeenObject, see_object
 from foretrace.twin.pushed import OUTCOMES, PushWorlds, gather_pushes, states_over_time, with_regions
-
-NAMES = (
-    "friction",
-    *("spread_x", "spread_y", "pressure_x", "pressure_y"),
-    *("outline_x", "outline_y", "rod_x", "rod_y"),
+from foretrace.twin.sliding_constants import (
+    AS_IT_IS,
+    FRICTION,
+    MOST_FITTED,
+    NAMES,
+    OWN,
+    SHARED,
+    SPREADS,
+    STEPS,
+    Change,
+    Group,
+    check_pushes,
+    fit_constants,
+    groups_of,
+    play_pushes,
 )
-"""Logarithm of the rod's friction over the nominal one; logarithms of how wide the weight is spread, 0 for evenly over
-the face; offset of its centre [cm]; offset of the outline in the object frame [mm]; of the rod in the table's [mm]."""
-SPREADS = (1, 2)
-"""Places of the spreads among the values."""
-FRICTION = 0.2
-"""Nominal friction coefficient between rod and object."""
-SHARED = np.array([0.4, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
-"""Prior standard deviation of what all shapes share; 0: nothing."""
-OWN = np.array([0.25, 0.35, 0.35, 0.25, 0.25, 0.5, 0.5, 0.3, 0.3])
-"""Prior standard deviation of each shape's own values around those."""
-STEP = np.array([0.05, 0.05, 0.05, 0.05, 0.05, 0.1, 0.1, 0.1, 0.1])
-"""Steps of the finite differences."""
-SCALE = np.array([0.0025, 0.0025, np.deg2rad(3.0)])
-"""Usual error of a good model: displacement [m] and turn [rad]."""
-ITERATIONS = 5
-"""Steps of the fit."""
-MOST_FITTED = 160
-"""Pushes of one shape that its values are fitted to; more of them tell little more."""
-STEPS = 40
-"""Steps of each push."""
+
 SAMPLE_PERIOD = 0.05
 """Time between imagined samples [s]."""
 TOGETHER = 2048
 """Worlds that are played at once, about."""
-
-Group = tuple[str, str]
-"""A surface and the name of a shape."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """A change of circumstances, to see how much a push depends on them."""
-
-    friction: float = 1.0
-    """Factor of the rod's friction."""
-    spread: float = 1.0
-    """Factor of how wide the weight is spread."""
-    left: float = 0.0
-    """Offset of the rod to the left of its motion [m]."""
-    turn: float = 0.0
-    """Turn of its motion to the left [rad]."""
 
 
 @dataclass(eq=False)
@@ -285,7 +253,7 @@ class SlidingTwin(Imaginer):
             )
         return push
 
-    def predict(self, pushes: RecordedPushes, change: Change = Change()) -> Float[np.ndarray, "pushes 3"]:
+    def predict(self, pushes: RecordedPushes, change: Change = AS_IT_IS) -> Float[np.ndarray, "pushes 3"]:
         """Displacement [m] and turn [rad] of each object, in its own frame at rest.
 
         Raises:
@@ -294,7 +262,9 @@ class SlidingTwin(Imaginer):
         check_pushes(pushes)
         found = np.zeros((len(pushes), 3))
         for group, rows in groups_of(pushes).items():
-            found[rows] = _play(pushes[rows], self.own.get(group, self.shared)[None], change, self.steps)[0]
+            found[rows] = play_pushes(
+                pushes[rows], self.own.get(group, self.shared)[None], change, self.steps
+            )[0]
         return found
 
     def calibrated(self, pushes: RecordedPushes) -> "SlidingTwin":
@@ -338,11 +308,11 @@ class SlidingTwin(Imaginer):
             raise PredictionError("no push to identify constants from: give at least one")
         rng = np.random.default_rng(seed)
         some = rng.permutation(len(pushes))[: 2 * MOST_FITTED]
-        shared, _ = _fit(pushes[np.sort(some)], np.zeros(len(NAMES)), SHARED)
+        shared, _ = fit_constants(pushes[np.sort(some)], np.zeros(len(NAMES)), SHARED)
         own, doubt = {}, {}
         for group, rows in groups_of(pushes).items():
             kept = np.sort(rng.permutation(rows)[:MOST_FITTED])
-            own[group], doubt[group] = _fit(pushes[kept], shared, OWN)
+            own[group], doubt[group] = fit_constants(pushes[kept], shared, OWN)
         nominal = np.where(np.isin(np.arange(len(NAMES)), SPREADS), 0.0, shared)
         return cls(nominal, own, own_doubt=doubt)
 
@@ -352,102 +322,3 @@ def _axes(scenes: Scenes, rows: np.ndarray) -> Float[np.ndarray, "rows 2 2"]:
     if isinstance(scenes.source, Candidates) or scenes.actions is None:
         return np.tile(np.eye(2), (len(rows), 1, 1))  # the view's frame takes the place of the object's
     return np.array([scenes.actions[row].T_action_object[:2, :2].T for row in rows])
-
-
-def check_pushes(pushes: RecordedPushes) -> None:
-    """Refuse what is no table of pushes.
-
-    Raises:
-        PredictionError: It is something else, such as interactions.
-    """
-    check_type(
-        "pushes", pushes, RecordedPushes, PredictionError, "RecordedPushes, as of(interactions) makes them"
-    )
-
-
-def groups_of(pushes: RecordedPushes) -> dict[Group, np.ndarray]:
-    """Rows of each shape on each surface."""
-    keys = [(pushes.surface[k], pushes.shapes[pushes.shape[k]].name) for k in range(len(pushes))]
-    return {key: np.array([k for k, each in enumerate(keys) if each == key]) for key in dict.fromkeys(keys)}
-
-
-def _play(
-    pushes: RecordedPushes,
-    values: Float[np.ndarray, "variants names"],
-    change: Change = Change(),
-    steps: int | None = None,
-) -> Float[np.ndarray, "variants pushes 3"]:
-    """Displacements and turns of pushes of one shape, by several sets of constants."""
-    shape, variants, count = pushes.shapes[pushes.shape[0]], len(values), len(pushes)
-    offset = 1e-3 * values[:, None, 5:7]
-    feet = feet_of(shape.model.corners, "uniform")
-    around = (feet - feet.mean(axis=0)) * np.exp(values[:, None, 1:3]) * change.spread
-    feet = shape.centroid + 1e-2 * values[:, None, 3:5] + around  # in the frame of the outline
-    turn = np.tile(-pushes.before[:, 2], variants)
-    rod = rotate_plane(np.repeat(1e-3 * values[:, 7:9], count, axis=0), turn).reshape(variants, count, 2)
-    motion = rotate_plane(pushes.motion, np.full(count, change.turn))
-    left = np.stack([-motion[:, 1], motion[:, 0]], axis=1) / np.linalg.norm(motion, axis=1)[:, None]
-    position, angle = slide(
-        Footprint(shape.model.corners, np.repeat(feet, count, axis=0)),
-        (pushes.start + rod + change.left * left - offset).reshape(-1, 2),
-        np.tile(motion, (variants, 1)),
-        pushes.radius,
-        np.repeat(FRICTION * np.exp(values[:, 0]) * change.friction, count),
-        steps or STEPS,
-    )
-    origin = np.repeat(offset[:, 0], count, axis=0)
-    moved = position + origin - rotate_plane(origin, angle)
-    return np.column_stack([moved, angle]).reshape(variants, count, 3)
-
-
-def _fit(
-    pushes: RecordedPushes, mean: Float[np.ndarray, " names"], std: Float[np.ndarray, " names"]
-) -> tuple[Float[np.ndarray, " names"], Float[np.ndarray, "names names"]]:
-    """Most probable values and their covariance, by Gauss and Newton's method.
-
-    Priors are normal, errors have long tails. A standard deviation of 0 of the spread along y ties it to that along x.
-    """
-    free = np.flatnonzero(std > 0)
-    tied = std[SPREADS[1]] == 0
-
-    def whole(values: np.ndarray) -> np.ndarray:
-        values = values.copy()
-        if tied:
-            values[SPREADS[1]] = values[SPREADS[0]]
-        return values
-
-    def residuals(values: np.ndarray) -> np.ndarray:
-        """One row for each set of constants."""
-        found = np.zeros((len(values), len(pushes), 3))
-        for rows in groups.values():
-            found[:, rows] = _play(pushes[rows], np.array([whole(each) for each in values]))
-        return ((found - truth) / SCALE).reshape(len(values), -1)
-
-    truth, groups = pushes.displacement(), groups_of(pushes)
-    values, covariance, damping = mean.copy(), np.diag(std**2), 1e-2
-    for _ in range(ITERATIONS):
-        errors, *stepped = residuals(np.stack([values, *(values + np.diag(STEP)[free])]))
-        slopes = ((np.array(stepped) - errors) / STEP[free, None]).T
-        # Student's t with two degrees of freedom: a push that went another way counts little.
-        weights = 3 / (2 + errors**2)
-        best = _cost(errors, values, mean, std, free)
-        precision = np.diag(1 / std[free] ** 2)
-        square = slopes.T @ (weights[:, None] * slopes) + precision
-        covariance[np.ix_(free, free)] = np.linalg.inv(square)
-        right = slopes.T @ (weights * errors) + (values - mean)[free] / std[free] ** 2
-        for _ in range(3):
-            trial = values.copy()
-            trial[free] -= np.linalg.solve(square + damping * np.diag(np.diag(square)), right)
-            if _cost(residuals(trial[None])[0], trial, mean, std, free) < best:
-                values, damping = trial, damping / 3
-                break
-            damping *= 10
-        else:
-            break
-    return whole(values), covariance
-
-
-def _cost(
-    errors: np.ndarray, values: np.ndarray, mean: np.ndarray, std: np.ndarray, free: np.ndarray
-) -> float:
-    return float(3 * np.log1p(errors**2 / 2).sum() + (((values - mean)[free] / std[free]) ** 2).sum())

@@ -16,7 +16,8 @@ from torch import nn
 from foretrace.errors import PredictionError
 from foretrace.geometry import rotate_plane, wrap_angle
 from foretrace.interactions.pushes import RecordedPushes
-from foretrace.twin.sliding import Change, SlidingTwin
+from foretrace.twin.sliding import SlidingTwin
+from foretrace.twin.sliding_constants import Change
 
 UNITS = np.array([0.003, 0.003, np.deg2rad(4.0)])
 """Usual size of a correction: displacement [m] and turn [rad]."""
