@@ -397,7 +397,9 @@ def test_names_that_look_like_numbers_and_strange_tables(tmp_path):
         text = text.replace(name, number)
     _file(shapes, shapes.read_text().replace("square", "1").replace("triangle", "2"))
     table = _file(table, text)
-    options = ["--pushes", str(table), "--shapes", str(shapes), "--methods", "simulation", "stays"]
+    options = ["--pushes", str(table), "--shapes", str(shapes), "--methods", "simulation"]  # without regions
+    assert main(["evaluate", "pushes", *options, "--out", str(tmp_path / "alone")]) == 0
+    options.append("stays")
     assert main(["evaluate", "pushes", *options, "--out", str(tmp_path / "out")]) == 0
     assert "shape 1" in (tmp_path / "out" / "report.md").read_text()
     doubled = _file(tmp_path / "twice.csv", table.read_text().replace("surface,", "x0,", 1))

@@ -105,13 +105,19 @@ def _interval(values: np.ndarray) -> list[float]:
 
 def _coverage(part: pd.DataFrame) -> dict[str, dict[str, float]] | None:
     """Share of the pushes that regions of each level hold; None of a method without regions."""
-    reached = {name: part[f"{name}_level"].to_numpy(float) for name in ("position", "rotation")}
+    reached = {name: _levels(part, name) for name in ("position", "rotation")}
     if np.isnan(reached["position"]).any():
         return None
     return {
         f"{level:.0%}": {name: float((values < level).mean()) for name, values in reached.items()}
         for level in LEVELS
     }
+
+
+def _levels(rows: pd.DataFrame, name: str) -> np.ndarray:
+    """Level of the region that just holds each push; NaN of methods without regions."""
+    column = f"{name}_level"  # which is missing where no method has regions
+    return rows[column].to_numpy(float) if column in rows else np.full(len(rows), np.nan)
 
 
 def report_of(summary: Mapping[str, Any]) -> str:
@@ -248,7 +254,7 @@ def draw_coverage(rows: pd.DataFrame) -> Figure:
     levels = np.linspace(0, 1, 101)
     for ax, name in zip(axes, ("position", "rotation"), strict=True):
         for method, color, style in (("residual", 0, "-"), ("learned", 1, "--"), ("identified", 2, "-.")):
-            reached = rows.loc[rows["method"] == method, f"{name}_level"].to_numpy(float)
+            reached = _levels(rows.loc[rows["method"] == method], name)
             if len(reached) and not np.isnan(reached).any():
                 held = [(reached < level).mean() for level in levels]
                 ax.plot(levels, held, style, color=PREDICTION_COLORS[color], label=WORDS[method])
