@@ -3,6 +3,7 @@
 Every object is seen once from above, on a pixel grid that lies at random; contacts all around its fitted outline, along
 the inward normal, are the candidates of all methods. Truths: ``nominal`` is MuJoCo with the whole arm and nominal
 constants; ``other`` is Bullet, with frictions and density drawn at random for each object, of which no method is told.
+There, ``identified`` has seen one lever-up of the object, at a contact drawn at random, as a tracker sees it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,14 +22,16 @@ from foretrace.actions import FAILED, Action, LeverUp, ToolPath
 from foretrace.errors import ForetraceError, ResultsError
 from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
 from foretrace.experiments import SUMMARIES
+from foretrace.experiments.executions import track
 from foretrace.experiments.planning_report import GOALS, METHODS, draw, report_of, summary_of
 from foretrace.experiments.planning_rules import ClosedForm, choose_by_rule
 from foretrace.files import short_hash
-from foretrace.imagined import Futures, ImaginedBatch, Imaginer, estimate_com
+from foretrace.imagined import Belief, Futures, ImaginedBatch, Imaginer, ObservedMotion, estimate_com
 from foretrace.imagined.observed import rotations_since_rest
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
+from foretrace.monitoring import identify
 from foretrace.objects import ObjectModel, sample_prism
 from foretrace.objects.solid import sample_box
 from foretrace.planning import Motions, PlanConfig, goals, plan
@@ -48,6 +51,8 @@ LEAST_FREE = 12
 """An object with fewer free contacts is drawn anew."""
 STREAM = 71
 """Tells the random numbers of these objects from those of data sets with the same seed."""
+BELIEVED = Belief(worlds=8)
+"""What is believed of frictions and density before the first lever-up, and the draws that a plan averages over."""
 DISTANCE = 0.03
 """How far away the place of goal ``move-to`` is [m]."""
 
@@ -164,20 +169,21 @@ class Planning(Experiment):
         for rule in ("longest edge", "far"):
             found[rule] = (choose_by_rule(rule, contacts, outline, com), 0.0)
         whole = PlanConfig(self._spacing(case), directions=1, refine=0, check=0)
-        check = replace(whole, check=8)
-        twin = self._twin if world == "nominal" else self._unsure_twin
+        check, few = replace(whole, check=8), replace(whole, check=4)
         plans: dict[str, tuple[Imaginer, Imaginer | None, PlanConfig, Mapping[str, Any]]] = {
             "closed form": (self._rule, None, whole, {}),
             "without uncertainty": (self._learned, None, replace(whole, criterion="likeliest"), seen),
             "learned": (self._learned, None, whole, seen),
-            "learned, checked": (
-                self._learned,
-                twin,
-                check if world == "nominal" else replace(whole, check=4),
-                seen,
-            ),
+            "learned, checked": (self._learned, self._twin, check, seen),
             "twin": (case.remembered(self._twin), None, whole, {}),
         }
+        if world != "nominal":
+            learned = {"context": case.identified(self._learned)}
+            plans |= {
+                "learned, checked": (self._learned, self._unsure_twin, few, seen),
+                "identified": (self._learned, None, whole, learned),
+                "identified, checked": (self._learned, self._twin, few, learned),
+            }
         for method, (imaginer, checker, config, told) in plans.items():
             started = perf_counter()
             made = plan(case.scene.view, goal, imaginer, config=config, checker=checker, **told)
@@ -211,7 +217,7 @@ class Planning(Experiment):
             pool = place(LeverUp, rim, along, np.zeros(self.contacts), [ToolPath()] * self.contacts)
             pool = pool[np.flatnonzero(find_free(scene, pool)[0])]
             if len(pool) >= LEAST_FREE:
-                return Case(obj, camera, scene, pool.actions, physics, self.seed)
+                return Case(obj, camera, scene, pool.actions, physics, int(rng.integers(1 << 32)))
         raise ResultsError(
             f"no {trial.family} with {LEAST_FREE} free contacts was drawn: give more --contacts"
         )
@@ -247,7 +253,9 @@ class Case:
     scene: Scene
     actions: tuple[Action, ...]
     physics: Physics
+    """Constants of the other world."""
     seed: int
+    """Decides which lever-up is learned from, and how it is tracked."""
 
     @cached_property
     def contacts(self) -> Float[np.ndarray, "n 2"]:
@@ -275,18 +283,38 @@ class Case:
     def truths(self, world: str) -> Motions:
         """What becomes of each candidate: a single future, which happened."""
         if world == "nominal":
-            config = SimulationConfig()
+            played = [simulate_lever_up(self.obj, each, SimulationConfig()) for each in self.placed]
         else:
-            config = SimulationConfig(engine="bullet", embodiment="tool", physics=self.physics)
-        turn, shift = self.camera.T_action_object[:2, :2], self.camera.contact
-        played = []
-        for action in self.actions:
-            contact = action.contact @ turn + shift
-            direction = action.direction @ turn
-            placed = LeverUp.nearest(self.obj, contact)
-            placed = replace(placed, direction=direction)
-            played.append(simulate_lever_up(self.obj, placed, config))
+            played = self.elsewhere
         return _as_motions(played, self.actions, self.scene)
+
+    @cached_property
+    def placed(self) -> list[LeverUp]:
+        """The candidates in the object frame."""
+        turn, shift = self.camera.T_action_object[:2, :2], self.camera.contact
+        return [
+            replace(LeverUp.nearest(self.obj, each.contact @ turn + shift), direction=each.direction @ turn)
+            for each in self.actions
+        ]
+
+    @cached_property
+    def elsewhere(self) -> list[Interaction]:
+        """What becomes of the candidates in the other world."""
+        config = SimulationConfig(engine="bullet", embodiment="tool", physics=self.physics)
+        return [simulate_lever_up(self.obj, each, config) for each in self.placed]
+
+    def identified(self, imaginer: Imaginer) -> Belief:
+        """What one lever-up in the other world, at a contact drawn at random, tells of its constants."""
+        if not hasattr(self, "_identified"):
+            rng = np.random.default_rng(self.seed)
+            k = rng.choice([k for k, each in enumerate(self.elsewhere) if each.effect.outcome != FAILED])
+            action, effect = self.placed[k], self.elsewhere[k].effect
+            tracked = track(effect.pose_trajectory, effect.times, "", rng)
+            seen = [row for row, pose in enumerate(tracked) if pose is not None]
+            motion = ObservedMotion(effect.times[seen], np.array([tracked[row] for row in seen]))
+            view = TopDownView.of(self.obj, action)
+            self._identified = identify(view, action, motion, BELIEVED, imaginer=imaginer)
+        return self._identified
 
     def remembered(self, twin: TwinImaginer) -> Imaginer:
         """The twin, which simulates these candidates once for all goals."""

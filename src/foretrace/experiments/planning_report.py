@@ -7,13 +7,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from foretrace.evaluation.charts import BLUE, GREEN, ORANGE, SKY, VERMILLION, finish, grid
+from foretrace.evaluation.charts import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, finish, grid
 from foretrace.evaluation.tables import markdown_table
 from foretrace.pictures.style import GREY, INK, new_figure, styled
 
 GOALS = ("lift", "tilt", "move", "move-to", "turn-over")
 """What is wanted: as high as possible without a slip; 0.5 rad; as far as possible in a direction; a place 3 cm away; as
 far as possible over towards a direction."""
+DARK_PURPLE = "#7a3e6c"
 SAFE = ("lift", "tilt")
 """Goals with a limit to slips."""
 METHODS = {
@@ -25,6 +26,8 @@ METHODS = {
     "learned": BLUE,
     "learned, checked": GREEN,
     "twin": VERMILLION,
+    "identified": PURPLE,
+    "identified, checked": DARK_PURPLE,
     "oracle": INK,
 }
 """Methods, with their colours."""
@@ -37,6 +40,8 @@ WORDS = {
     "learned": "planner, learned",
     "learned, checked": "planner, learned, best few checked by the twin",
     "twin": "twin of every candidate",
+    "identified": "planner, learned, after one lever-up of the object",
+    "identified, checked": "planner, after one lever-up, best few checked by the twin",
     "oracle": "oracle: truth of every candidate",
 }
 DRAWS = 2000
