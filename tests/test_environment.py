@@ -48,7 +48,7 @@ def test_reward_is_what_the_goal_makes_of_what_is_simulated():
     _, reward, over, _, info = made.step(np.array([0.0, 0.0], dtype=np.float32))
     assert over
     assert info["free"]
-    _, camera, _, _ = made._drawn
+    camera = made.episode.camera
     turn = camera.T_action_object[:2, :2]
     contact = np.array(info["contact"]) @ turn + camera.contact
     again = ft.simulate(BOX, ft.LeverUp.nearest(BOX, contact), embodiment="tool").effect
@@ -57,6 +57,52 @@ def test_reward_is_what_the_goal_makes_of_what_is_simulated():
         assert reward == pytest.approx(10 * rise, abs=0.02)
     else:
         assert reward == 0
+
+
+def test_several_steps_earn_by_how_much_nearer_the_goal_each_brings():
+    """Rewards add up to the fall of the cost; the view shows the object as it lies, the camera stays."""
+    made = environment.LeverUpEnv(ft.goals.Move((1.0, 0.0)), steps=3)
+    seen, _ = made.reset(seed=2, options={"object": BOX})
+    com = np.append(environment.observed_view(seen).contour().mean(axis=0), 0.0)
+    total, ends = 0.0, []
+    for _ in range(3):
+        before = seen["mask"]
+        seen, reward, ended, cut, info = made.step(np.array([-0.9, 0.0], dtype=np.float32))
+        total += reward
+        ends.append((ended, cut))
+        assert (seen["mask"] != before).any(), "the object has moved in the view"
+        moved = info["T_start_now"] @ np.append(com, 1.0)
+        middle = environment.observed_view(seen).contour().mean(axis=0)
+        np.testing.assert_allclose(moved[:2], middle, atol=0.003)
+        if ended or cut:
+            break
+    assert total == pytest.approx(-info["cost"], abs=1e-6), "at the start, the object has not moved"
+    assert info["reached"] == ended
+    assert ends[-1] == (ended, made.episode.steps == 3 and not ended)
+    assert not any(any(each) for each in ends[:-1])
+    with pytest.raises(PlanningError, match="call reset"):
+        made.step(np.zeros(2, dtype=np.float32))
+
+
+def test_an_episode_goes_on_after_a_contact_that_no_blade_gets_to_and_is_cut_off():
+    made = gymnasium.make("foretrace/LeverUp-v1", goal=ft.goals.Turn(1.5), steps=2, render_mode="rgb_array")
+    made.reset(seed=0)
+    env = made.unwrapped
+    within = env.episode.scene.outline.mean(axis=0)
+    env.lever_up = lambda action: ft.LeverUp(within, (1.0, 0.0))
+    found = [made.step(np.zeros(2, dtype=np.float32)) for _ in range(2)]
+    assert [each[1:4] for each in found] == [(-1.0, False, False), (-1.0, False, True)]
+    assert made.render().shape == (384, 384, 3)
+
+
+def test_an_episode_ends_where_the_object_lies_on_another_side():
+    made = environment.LeverUpEnv(ft.goals.Move((1.0, 0.0)), steps=5)
+    made.reset(seed=0, options={"object": ft.Box(0.05, 0.04, 0.1)})
+    for _ in range(5):
+        _, _, ended, _, info = made.step(np.array([0.0, 0.0], dtype=np.float32))
+        if ended:
+            break
+    assert "another side" in info["lost"]
 
 
 def triangle(rng):
@@ -105,6 +151,8 @@ def test_a_plan_is_the_action_that_it_means():
         (lambda: _after_reset().step(np.zeros(3, np.float32)), "finite numbers"),
         (lambda: _after_reset().step(np.full(2, np.nan, np.float32)), "finite numbers"),
         (lambda: environment.LeverUpEnv().reset(options={"object": 3}), "object of type int"),
+        (lambda: environment.LeverUpEnv(steps=0), "steps is 0: give a whole number from 1 to 20"),
+        (lambda: environment.LeverUpEnv(steps=3), "a goal about where it lies"),
     ],
 )
 def test_mistakes_are_told_in_one_line(make, message):

@@ -11,11 +11,9 @@ from jaxtyping import Float, Int
 from foretrace.actions import Action
 from foretrace.errors import ForetraceError, PlanningError, check_type, fault, is_whole, shown
 from foretrace.files import as_path, write_json
-from foretrace.geometry import Numbers, finite_array, invert_transform, matrix_to_pose, transform_points
-from foretrace.imagined import IMAGINERS, Belief, Futures, ImaginedBatch, Imaginer, estimate_com
+from foretrace.geometry import Numbers, finite_array, invert_transform
+from foretrace.imagined import IMAGINERS, Belief, ImaginedBatch, Imaginer
 from foretrace.imagined.context import Context
-from foretrace.imagined.observed import rotations_since_rest
-from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
@@ -24,6 +22,7 @@ from foretrace.planning.goals.base import LEVERED
 from foretrace.planning.lessons import Lesson, taught
 from foretrace.planning.motions import Motions
 from foretrace.planning.plan import PlanConfig
+from foretrace.planning.resting import SURE, com_of, judge_rest
 from foretrace.planning.result import Plan
 from foretrace.planning.scores import score
 from foretrace.planning.search import Search
@@ -39,8 +38,6 @@ STEP_COST = 0.02
 """A further action has to lower the cost by more than this: 2 mm."""
 SIMULATED = PlanConfig(spacing=0.02, directions=1, refine=0)
 """How candidates are searched where each takes a simulation."""
-SURE = 0.5
-"""A goal counts as reached from this probability on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +169,7 @@ def plan_sequence(
     config = _config(config, imaginer)
     aim, scene = _begin(seen, goal, steps, com)
     own = _resting(imaginer, scene)
-    if _state(aim, scene, _com_of(scene), np.eye(4))[1]:
+    if judge_rest(aim, scene, com_of(scene), np.eye(4)).reached:
         raise PlanningError(f"the goal {describe(aim)} is reached already: give another one")
     return _plan(scene, aim, steps, own, context, config)[0]
 
@@ -208,13 +205,13 @@ def execute_sequence(
     config = _config(config, imaginer)
     aim, scene = _begin(seen, goal, steps, None)
     own = _resting(imaginer, scene)
-    T_start_table, com = invert_transform(T_table_start), _com_of(scene)
+    T_start_table, com = invert_transform(T_table_start), com_of(scene)
     frames, actions, outcomes, sequences = [np.eye(4)], [], [], []
     expected: list[tuple[Action, np.ndarray]] = []
-    state = _state(aim, scene, com, np.eye(4))
+    state = judge_rest(aim, scene, com, np.eye(4))
     known: Search | None = None
     lessons: list[Lesson] = []
-    while len(actions) < steps and not state[1]:
+    while len(actions) < steps and not state.reached:
         if replan or not sequences:
             try:
                 if actions:
@@ -224,7 +221,7 @@ def execute_sequence(
                 if not actions:
                     raise
                 break  # it lies where nothing gets there, or on another side
-            if actions and found.cost >= state[0]:
+            if actions and found.cost >= state.cost:
                 break  # nothing brings it nearer
             sequences.append(found)
             expected = list(zip(found.actions, found.frames, strict=False))
@@ -239,9 +236,9 @@ def execute_sequence(
             # Against what was imagined: what was expected after earlier lessons would count these twice.
             imagined = _first_motion(sequences[-1].plan, scene).resting_frames()[0][0]
             lessons.append(Lesson.of(action, imagined, invert_transform(frames[-2]) @ frames[-1]))
-        state = _state(aim, scene, com, frames[-1], outcomes[-1])
+        state = judge_rest(aim, scene, com, frames[-1], outcomes[-1])
     return Execution(
-        tuple(actions), tuple(outcomes), np.array(frames), tuple(sequences), bool(state[1]), float(state[0])
+        tuple(actions), tuple(outcomes), np.array(frames), tuple(sequences), state.reached, state.cost
     )
 
 
@@ -308,7 +305,7 @@ def _plan(
     start = np.eye(4) if scene.T_start_now is None else scene.T_start_now
     rows, cost, reached = np.zeros(0, dtype=np.int64), np.inf, 0.0
     if steps > 1 and scores.reached[scores.order()[0]] < SURE:
-        rows, cost, reached = _compose(search, start, _com_of(scene), steps)
+        rows, cost, reached = _compose(search, start, com_of(scene), steps)
     if len(rows) < 2:
         plan = search.finish(pool, scores)
         actions, cost, reached = (plan.action,), plan.cost, plan.reached
@@ -380,30 +377,3 @@ def _compose(
         if not beginnings:
             break
     return np.array(chosen, dtype=np.int64), best[1], reached
-
-
-def _com_of(scene: Scene) -> Float[np.ndarray, "3"]:
-    """Centre of mass before the first action, in the goal's frame [m]."""
-    if scene.com_start is not None:
-        return scene.com_start
-    if scene.com is not None:
-        return scene.com
-    middle = estimate_com(InteractionBatch.from_views([scene.view]))[0]
-    return transform_points(invert_transform(scene.T_view_object), middle[None])[0]
-
-
-def _state(
-    aim: Goal, scene: Scene, com: Float[np.ndarray, "3"], T_start_now: np.ndarray, outcome: str = "at rest"
-) -> tuple[float, bool]:
-    """Cost of how the object lies now, and whether the goal is reached."""
-    poses = np.array([np.eye(4), T_start_now])
-    way = transform_points(T_start_now, com[None])[0]
-    futures = Futures.point(
-        np.array([[com, way]]), rotations_since_rest(matrix_to_pose(poses))[None], outcome
-    )
-    motions = Motions(
-        (), np.array([0.0, 1.0]), futures.com, futures.states[..., 3:], futures, np.array([1]), scene.outline,
-        scene.height,
-    )  # fmt: skip
-    found = score(aim, motions, "expected", 1.0)
-    return float(found.cost[0]), bool(found.reached[0] >= SURE)
