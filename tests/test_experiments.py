@@ -91,7 +91,7 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "other-world": lambda root: {"data": root / "blade", "lever_ups": (0, 6), "seeds": (0,), "proportional": True,
                                  "recipe": QUICK["one-shot"],
                                  "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
-    "identification": lambda root: {"objects": 1},
+    "identification": lambda root: {"objects": 1, "lever_ups": 1},
     "monitoring": lambda root: {"executions": 2, "faults": 1, "parts": ("calibration", "normal", "slip", "freeze")},
     "shipped": lambda root: {"objects": 2, "twin": True},
     "pushes": lambda root: dict(zip(("pushes", "shapes"), factories.write_push_table(root, 90), strict=True))

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ EVERY = {
     "slide-off": goals.SlideOff((0.1, 0.0), (1.0, 0.0)),
     "avoid": goals.Avoid(ZONE),
     "keep-upright": goals.KeepUpright(),
+    "learn": goals.Learn(),
 }
 
 
@@ -89,7 +91,7 @@ def motions_of(
         np.ones(99),
     )
     batch = ImaginedBatch(times, states[:, 0, :, :3], None, futures)
-    return Motions.of(batch, [action], PRISM.corners, PRISM.height)
+    return replace(Motions.of(batch, [action], PRISM.corners, PRISM.height), gain=np.array([0.7]))
 
 
 # Goals
@@ -122,6 +124,7 @@ def test_goal_moves_with_the_object(label):
     moved_action = ft.LeverUp(turn @ action.contact + shift, turn @ action.direction)
     batch = ImaginedBatch(plain.times, plain.futures.com[:, 0], None, plain.futures)
     moved = Motions.of(batch, [moved_action], PRISM.corners @ turn.T + shift, PRISM.height)
+    moved = replace(moved, gain=plain.gain)
     other = {
         "move": goals.Move(turn @ [1.0, 0.5]),
         "move-to": goals.MoveTo(turn @ [0.05, 0.02] + shift, turn=0.1),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from foretrace.interactions.dataset import Dataset
     from foretrace.interactions.record import Effect, Interaction, Outcome, Physics
     from foretrace.interactions.topdown import TopDownView
-    from foretrace.monitoring import Drift, Monitor, MonitorCalibration, Verdict, identify
+    from foretrace.monitoring import Drift, Monitor, MonitorCalibration, Verdict, identify, information_gain
     from foretrace.objects import (
         Bevel,
         Box,
@@ -52,7 +52,10 @@ _HOMES = {
     "foretrace.interactions.dataset": ("Dataset",),
     "foretrace.interactions.record": ("Effect", "Interaction", "Outcome", "Physics"),
     "foretrace.interactions.topdown": ("TopDownView",),
-    "foretrace.monitoring": ("Drift", "Monitor", "MonitorCalibration", "Verdict", "identify"),
+    "foretrace.monitoring": (
+        *("Drift", "Monitor", "MonitorCalibration", "Verdict"),
+        *("identify", "information_gain"),
+    ),
     "foretrace.objects": (
         *("Bevel", "Box", "Cylinder", "MeshObject", "Prism", "Weighted"),
         *("paper_objects", "sample_prism"),
@@ -119,6 +122,7 @@ __all__ = [
     "execute_sequence",
     "goals",
     "identify",
+    "information_gain",
     "load_predictor",
     "paper_objects",
     "plan",

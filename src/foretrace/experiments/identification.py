@@ -8,42 +8,41 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter
-from scipy.stats import kstest
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ResultsError, ShapeError, ViewError
-from foretrace.evaluation.charts import GREEN, ORANGE, SKY, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial
-from foretrace.evaluation.statistics import interval
-from foretrace.evaluation.tables import markdown_table, mean_with_interval, number
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.executions import PERIOD, Scene, track
+from foretrace.experiments.identification_report import NAMES, figures, report, summarise
 from foretrace.experiments.monitor_calibration import predictor
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import Belief, ObservedMotion
-from foretrace.imagined.belief import RANGES
+from foretrace.imagined.belief import COM, RANGES
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import identify
+from foretrace.monitoring.identification import COM_RANGE
 from foretrace.objects import Prism, Weighted, sample_prism
-from foretrace.pictures.style import new_figure, styled
+from foretrace.planning import goals, plan
 from foretrace.predictor.loading import default_checkpoint
 from foretrace.twin import TwinConfig, TwinImaginer
 
 LEARNED_FROM, TRIED = 3, 3
 """Lever-ups of each object that are learned from, and others that are imagined."""
-SHOWN = (1, 3)
-"""Numbers of lever-ups after which results are looked at."""
+Choice = Literal["random", "chosen"]
+CHOICES: tuple[Choice, ...] = ("random", "chosen")
+"""How lever-ups that are learned from are chosen: at random places, or by what they are expected to tell."""
+PRIOR = Belief(dict.fromkeys(COM, (-COM_RANGE, COM_RANGE)))
+"""What is believed of an object before its first lever-up, as `identify` takes it."""
 LARGEST_OFFSET = 0.02
 """Largest offset of the centre of mass [m]."""
-NAMES = ("friction", "tool_friction", "density", "com_x", "com_y")
 CM, MM = 100.0, 1000.0
 
 
@@ -53,11 +52,13 @@ class IdentificationTrial(Trial):
 
     object: int
     """Its number."""
+    choice: str
+    """How the lever-ups that are learned from are chosen: one of `CHOICES`."""
 
 
 @dataclass(frozen=True)
 class Identification(Experiment):
-    """Learn constants from lever-ups of one object, and imagine others."""
+    """Learn constants from lever-ups of one object, at random places or chosen ones, and imagine others."""
 
     objects: int = 24
     """Number of objects."""
@@ -65,21 +66,27 @@ class Identification(Experiment):
     """Seed of objects and worlds."""
     exact: bool = False
     """Whether the twin plays the best worlds again."""
+    choices: tuple[Choice, ...] = CHOICES
+    """How lever-ups are chosen: at random, or by what they are expected to tell."""
+    lever_ups: int = LEARNED_FROM
+    """Lever-ups that are learned from, from 1 to 3."""
 
     label = "identification"
     summary = SUMMARIES["identification"]
     trial = IdentificationTrial
 
     def trials(self) -> Sequence[IdentificationTrial]:
-        """One for each object."""
+        """One for each object and choice."""
         if self.objects < 1:
             raise ResultsError(f"objects is {self.objects}: give at least 1")
-        return [IdentificationTrial(k) for k in range(self.objects)]
+        if not 1 <= self.lever_ups <= LEARNED_FROM:
+            raise ResultsError(f"lever_ups is {self.lever_ups}: give a number from 1 to {LEARNED_FROM}")
+        return [IdentificationTrial(k, choice) for choice in self.choices for k in range(self.objects)]
 
     def identity(self) -> dict[str, Any] | None:
-        """The predictor and the seed."""
+        """The predictor, the seed, and what is learned from."""
         config = (default_checkpoint() / "config.json").read_bytes()
-        own = {"predictor": short_hash([config]), "seed": self.seed}
+        own = {"predictor": short_hash([config]), "seed": self.seed, "lever_ups": self.lever_ups}
         return own | {"exact": True} if self.exact else own
 
     def run(self, trial: IdentificationTrial, folder: Path) -> Sequence[Row]:
@@ -87,125 +94,38 @@ class Identification(Experiment):
         rng = np.random.default_rng([self.seed, trial.object])
         case = _draw(rng)
         rows: list[Row] = []
-        belief: Belief | None = None
-        begin = time.process_time()
+        belief = PRIOR
+        learning = choosing = 0.0
         twin = TwinImaginer(config=TwinConfig(workers=1)) if self.exact else None
-        for k, action in enumerate(case.actions[:LEARNED_FROM]):
-            poses = case.play(action, rng)
-            tracked = track(poses, PERIOD * np.arange(len(poses)), "", rng)
-            seen = np.array([j for j, pose in enumerate(tracked) if pose is not None])
-            motion = ObservedMotion(PERIOD * seen, np.array([tracked[j] for j in seen]))
-            belief = identify(
-                TopDownView.of(case.prism, action),
-                action,
-                motion,
-                belief,
-                imaginer=predictor(),
-                exact=twin,
-                seed=k,
-            )
-            if k + 1 in SHOWN:
-                rows += _about(belief, case, k + 1)
-                kept = {f"after {k + 1}": belief}
-                rows += _errors(case, kept, rng_of(self.seed, trial.object))
-        rows.append({"metric": "seconds", "value": (time.process_time() - begin) / LEARNED_FROM})
+        for k in range(self.lever_ups):
+            begin = time.process_time()
+            action = case.actions[k]
+            if trial.choice == "chosen":
+                action = case.choose(belief)
+            choosing += time.process_time() - begin
+            motion = case.observe(action, rng)
+            begin = time.process_time()
+            view = TopDownView.of(case.prism, action)
+            belief = identify(view, action, motion, belief, imaginer=predictor(), exact=twin, seed=k)
+            learning += time.process_time() - begin
+            rows += _about(belief, case, k + 1)
+            rows += _errors(case, {f"after {k + 1}": belief}, rng_of(self.seed, trial.object))
+        rows.append({"metric": "seconds", "value": learning / self.lever_ups})
+        if trial.choice == "chosen":
+            return [*rows, {"metric": "seconds of choosing", "value": choosing / self.lever_ups}]
         return [*rows, *_errors(case, {}, rng_of(self.seed, trial.object))]
 
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
-        """Means with intervals by metric; calibration of ranks; shares of the gain."""
-        values = {str(name): np.asarray(each, dtype=float) for name, each in rows.groupby("metric")["value"]}
-        summary: dict[str, Any] = {"objects": len(set(np.asarray(rows["object"]).tolist()))}
-        summary["metrics"] = {
-            name: interval(each, 0.0).as_dict(4) | {"median": float(np.median(each))}
-            for name, each in values.items()
-            if not name.startswith("rank")
-        }
-        summary["ranks"] = {
-            name.removeprefix("rank "): float(kstest(each, "uniform").pvalue)
-            for name, each in values.items()
-            if name.startswith("rank")
-        }
-        if {"error nothing", "error told"} <= set(values):
-            gain = values["error nothing"].mean() - values["error told"].mean()
-            summary["gain"] = {
-                str(count): float(
-                    (values["error nothing"].mean() - values[f"error after {count}"].mean()) / gain
-                )
-                for count in SHOWN
-                if f"error after {count}" in values
-            }
-        return summary
+        """Means with intervals by choice and metric; calibration of ranks; shares of the gain; differences."""
+        return summarise(rows)
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """Tables of errors and of calibration."""
-        found = summary["metrics"]
-        words = {
-            "error nothing": "told nothing",
-            "error after 1": "after 1 lever-up",
-            "error after 3": "after 3 lever-ups",
-            "error told": "told everything",
-        }
-        lines = [
-            [words[name], mean_with_interval(found[name]), number(found[name]["median"])]
-            for name in words
-            if name in found
-        ]
-        parts = [
-            "# Identification",
-            f"{summary['objects']} objects, {TRIED} other lever-ups of each.",
-            markdown_table(["Error of other lever-ups [cm]", "Mean", "Median"], lines),
-        ]
-        if "gain" in summary:
-            shares = ", ".join(f"{100 * each:.0f} % after {count}" for count, each in summary["gain"].items())
-            parts.append(f"Share of the gain that being told everything gives: {shares}.")
-        lines = [
-            [
-                f"after {count}",
-                mean_with_interval(found[f"com {count}"], 2),
-                number(found[f"com {count}"]["median"], 2),
-            ]
-            for count in SHOWN
-            if f"com {count}" in found
-        ]
-        parts.append(markdown_table(["Error of the centre of mass [mm]", "Mean", "Median"], lines))
-        lines = [
-            [
-                name,
-                *(number(found[f"std {name} {count}"]["mean"], 2) for count in SHOWN),
-                *(number(summary["ranks"][f"{name} {count}"], 3) for count in SHOWN),
-            ]
-            for name in NAMES
-        ]
-        head = ["", *(f"Spread after {count}, of the prior's" for count in SHOWN)]
-        head += [f"Ranks after {count}: p" for count in SHOWN]
-        parts.append(markdown_table(head, lines))
-        parts.append(f"One identification: {found['seconds']['median']:.1f} s of processor time.")
-        return "\n\n".join(parts) + "\n"
+        return report(summary, TRIED)
 
-    @styled
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
-        """Errors of other lever-ups, object by object."""
-        values = {str(name): np.asarray(each, dtype=float) for name, each in rows.groupby("metric")["value"]}
-        names = [
-            name
-            for name in ("error nothing", "error after 1", "error after 3", "error told")
-            if name in values
-        ]
-        if len(names) < 2:
-            return {}
-        fig = new_figure(6.5, 4.2)
-        ax = fig.subplots()
-        for k, (name, color) in enumerate(zip(names, ("#8b93a1", SKY, ORANGE, GREEN), strict=False)):
-            ax.plot(np.full(len(values[name]), k), values[name], "o", color=color, alpha=0.4, markersize=4)
-            ax.plot([k - 0.25, k + 0.25], [values[name].mean()] * 2, color=color, linewidth=2.5)
-        ax.set_xticks(range(len(names)), [name.removeprefix("error ") for name in names])
-        ax.set_yscale("log")
-        ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-        grid(ax, ylabel="error of other lever-ups [cm]")
-        finish(
-            fig, "What was learned, on other lever-ups of the same object", "lines: means; points: objects"
-        )
-        return {"errors": fig}
+        """Errors of other lever-ups, object by object, and errors by the number of lever-ups."""
+        return figures(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +140,19 @@ class Case:
     """Its world."""
     actions: tuple[LeverUp, ...]
     """Lever-ups: those to learn from, then the others."""
+
+    def choose(self, belief: Belief) -> LeverUp:
+        """The lever-up that is expected to tell most."""
+        found = plan(self.prism, goals.Learn(), predictor(), belief).action
+        assert isinstance(found, LeverUp)
+        return found
+
+    def observe(self, action: LeverUp, rng: np.random.Generator) -> ObservedMotion:
+        """What a tracker sees of a lever-up."""
+        poses = self.play(action, rng)
+        tracked = track(poses, PERIOD * np.arange(len(poses)), "", rng)
+        seen = np.array([j for j, pose in enumerate(tracked) if pose is not None])
+        return ObservedMotion(PERIOD * seen, np.array([tracked[j] for j in seen]))
 
     def play(self, action: LeverUp, rng: np.random.Generator) -> np.ndarray:
         """(time, 7) Poses of the object frame in the action frame, with an execution error."""

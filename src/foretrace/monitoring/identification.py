@@ -9,6 +9,7 @@ from scipy.special import logsumexp
 
 from foretrace.actions import Action
 from foretrace.errors import MonitoringError, check_type
+from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import IMAGINERS, Imaginer, ObservedMotion, estimate_com
 from foretrace.imagined.belief import COM, EXECUTION, Belief
 from foretrace.imagined.context import parameters_of
@@ -18,7 +19,7 @@ from foretrace.imagined.worlds import play_worlds
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Effect
 from foretrace.interactions.topdown import TopDownView
-from foretrace.monitoring.motions import TURN_LENGTH, place_of
+from foretrace.monitoring.motions import TURN_LENGTH
 
 COM_RANGE = 0.025
 """Range of the centre of mass about where it is seen, along each axis of the object frame, by default [m]."""
@@ -125,34 +126,62 @@ def log_likelihood(
         width: Error of the imaginer [m].
     """
     inside = motion.times <= played.times[-1]
-    motion = ObservedMotion(motion.times[inside], motion.poses[inside])
-    futures, times = played.futures, motion.times
+    poses = motion.poses[inside]
+    rotations = rotations_since_rest(poses)
+    return log_likelihoods(played, motion.times[inside], poses[None], rotations[None], width)[0]
+
+
+def log_likelihoods(
+    played: ImaginedBatch,
+    times: Float[np.ndarray, " time"],
+    poses: Float[np.ndarray, "motions time 7"],
+    rotations: Float[np.ndarray, "motions time 3"],
+    width: float,
+) -> Float[np.ndarray, "motions worlds"]:
+    """As `log_likelihood`, of several motions with the same times that end no later than the played ones.
+
+    Args:
+        played: As of `log_likelihood`.
+        times: Time of each sample [s].
+        poses: Poses of any frame of the object in the frame of the action as commanded.
+        rotations: Their rotation vectors since rest [rad].
+        width: Error of the imaginer [m].
+    """
+    futures = played.futures
     world, slot = np.nonzero(futures.counted)
     states = futures.states[world, slot]
     points = states[:, 0, :3]
-    relative = np.concatenate([states[..., :3] - points[:, None], TURN_LENGTH * states[..., 3:]], axis=-1)
     place = np.interp(times, played.times, np.arange(len(played.times)))
     k = np.minimum(place.astype(int), len(played.times) - 2)
     share = (place - k)[:, None]
-    expected = (1 - share) * relative[:, k] + share * relative[:, k + 1]
-    rest, turned = motion.poses[0], TURN_LENGTH * rotations_since_rest(motion.poses)
-    moved = np.stack([place_of(pose, rest, points) for pose in motion.poses], axis=1)
-    off = np.concatenate([moved, np.broadcast_to(turned, moved.shape)], axis=-1) - expected
+    expected = (1 - share) * states[:, k] + share * states[:, k + 1]  # (rows, time, 6)
+    rest, turned = poses[:, :1], TURN_LENGTH * rotations
+    turns = quaternion_to_matrix(poses[..., 3:]) @ np.swapaxes(quaternion_to_matrix(rest[..., 3:]), -1, -2)
+    # Where each world's centre of mass is carried, (motions, rows, time, 3).
+    arms = points - rest[..., :3]
+    carried = np.swapaxes(arms[:, None] @ np.swapaxes(turns, -1, -2), 1, 2)
+    off = poses[:, None, :, :3] + carried - (rest[:, :, None, :3] + arms[:, :, None])
+    moved = np.linalg.norm(np.concatenate([off[:, 0], turned], axis=-1), axis=-1) > MOVING
+    off -= expected[..., :3] - points[:, None]
+    square = np.einsum("nrti,nrti->nrt", off, off)
+    off = turned[:, None] - TURN_LENGTH * expected[..., 3:]
+    square += np.einsum("nrti,nrti->nrt", off, off)
     # The observed motion's own speed decides, or slow worlds would be favoured for their narrow bands.
-    seen = np.concatenate([motion.poses[:, :3] - rest[:3], turned], axis=1)
-    speed = np.linalg.norm(np.gradient(seen, times, axis=0), axis=1) if len(times) > 1 else np.zeros(1)
-    square = (off**2).sum(axis=-1) / (width + SPEED_TIME * maximum_filter1d(speed, 3)) ** 2
+    seen = np.concatenate([poses[..., :3] - rest[..., :3], turned], axis=-1)
+    speed = np.zeros(seen.shape[:2])
+    if len(times) > 1:
+        speed = np.linalg.norm(np.gradient(seen, times, axis=1), axis=-1)
+    square /= (width + SPEED_TIME * maximum_filter1d(speed, 3, axis=1))[:, None] ** 2
     duration = np.minimum(np.diff(times, prepend=times[0]), LONGEST_STEP)
-    moving = np.linalg.norm(np.concatenate([moved[0], turned], axis=1), axis=1) > MOVING
-    counts = RATE * duration * np.maximum.accumulate(moving)
-    if (
-        total := counts.sum()
-    ) > 0:  # where no world fits within the width, it is as wide as the best one is off
-        square = square / max(1.0, float((square * counts).sum(axis=1).min() / total))
-    log = -0.5 * (TAIL + 1) * (np.log1p(square / TAIL) * counts).sum(axis=1)
-    found = np.full(futures.probability.shape, -np.inf)
-    found[world, slot] = log + np.log(futures.probability[world, slot])
-    return np.asarray(logsumexp(found, axis=1))
+    counts = RATE * duration * np.maximum.accumulate(moved, axis=1)  # (motions, time)
+    total = counts.sum(axis=1)
+    # Where no world fits within the width, it is as wide as the best one is off.
+    least = np.einsum("nrt,nt->nr", square, counts).min(axis=1) / np.where(total > 0, total, 1.0)
+    square /= np.maximum(1.0, least)[:, None, None]
+    log = -0.5 * (TAIL + 1) * np.einsum("nrt,nt->nr", np.log1p(square / TAIL), counts)
+    found = np.full((len(poses), *futures.probability.shape), -np.inf)
+    found[:, world, slot] = log + np.log(futures.probability[world, slot])
+    return np.asarray(logsumexp(found, axis=2))
 
 
 def _spread_out(

@@ -42,6 +42,8 @@ class Motions:
     """Outline of the object at rest [m], counter-clockwise."""
     height: float
     """Its height [m]."""
+    gain: Float[np.ndarray, " batch"] | None = None
+    """Information that each action is expected to give about the object's constants, where a goal asks for it [nat]."""
 
     @classmethod
     def of(
@@ -81,6 +83,7 @@ class Motions:
 
     def __getitem__(self, rows: np.ndarray) -> "Motions":
         kept = {name: getattr(self, name)[rows] for name in ("com", "turned", "futures", "end")}
+        kept["gain"] = None if self.gain is None else self.gain[rows]
         return replace(self, actions=tuple(self.actions[k] for k in np.arange(len(self))[rows]), **kept)
 
     def thinned(self, count: int) -> "Motions":
@@ -126,6 +129,7 @@ class Motions:
             self.end + 1,
             self.outline,
             self.height,
+            self.gain,
         )
 
     def moved_on(self, by: Float[np.ndarray, "batch 3"]) -> "Motions":

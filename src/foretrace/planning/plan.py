@@ -18,7 +18,7 @@ from foretrace.imagined.context import Context, first_action
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
-from foretrace.planning.goals import Goal, as_goal
+from foretrace.planning.goals import Goal, as_goal, describe
 from foretrace.planning.result import Plan
 from foretrace.planning.scores import Criterion
 from foretrace.planning.search import Search
@@ -71,6 +71,10 @@ class PlanConfig:
         check_choices(PlanningError, self)
 
 
+LEARNING = PlanConfig(spacing=0.02, directions=1, refine=0)
+"""How candidates are searched where a goal asks what they tell, which takes a fifth of a second for each."""
+
+
 def plan(
     seen: ObjectModel | TopDownView,
     goal: Goal | Callable[..., Any],
@@ -78,7 +82,7 @@ def plan(
     context: Context | Belief = None,
     *,
     checker: Imaginer | None = None,
-    config: PlanConfig = PlanConfig(),
+    config: PlanConfig | None = None,
     com: Numbers | None = None,
     T_table_object: Float[np.ndarray, "4 4"] | None = None,
     reach: Reach | None = None,
@@ -96,9 +100,10 @@ def plan(
         imaginer: Imagines the candidates, and says what kind of action they are; by default the predictor that comes
             with foretrace, of lever-ups. `SlidingTwin` is one of pushes.
         context: What both imaginers are told, as of `Imaginer.imagine`.
-        checker: Checks the best candidates; by default the twin, which simulates lever-ups. Where simulation is not
-            installed they are not checked, and a warning says so.
-        config: How candidates are searched; stages can be left out.
+        checker: Checks the best candidates; by default the twin, which simulates lever-ups, but not for `Learn`. Where
+            simulation is not installed they are not checked, and a warning says so.
+        config: How candidates are searched; stages can be left out. By default `PlanConfig`, and `LEARNING` for
+            `Learn`.
         com: Centre of mass at rest in the object's frame [m]; by default the object's own, or estimated from the view.
         T_table_object: The object's pose in the table frame, if the plan is for a robot.
         reach: Says why the robot cannot carry out an action, or None.
@@ -108,10 +113,10 @@ def plan(
 
     Raises:
         PlanningError: The goal is none, is impossible for this object, or needs what the imaginer does not tell; no
-            contact is free, or the robot reaches none of the best.
+            contact is free, or the robot reaches none of the best; `Learn` has no belief as context.
         PredictionError: The view does not show one object, or the context is of no use to an imaginer.
     """
-    check_type("config", config, PlanConfig, PlanningError)
+    check_type("config", config, (PlanConfig, type(None)), PlanningError)
     for name, value in (("imaginer", imaginer), ("checker", checker)):
         check_type(name, value, (Imaginer, type(None)), PlanningError, "an imaginer, such as a predictor")
     if reach is not None and not callable(reach):
@@ -122,6 +127,13 @@ def plan(
     aim.check(scene.outline)
     if com is not None:
         scene = scene.loaded(finite_array("com (x, y, z) [m]", com, (3,), PlanningError))
+    learns = aim.needs_gain()
+    if learns and not isinstance(context, Belief):
+        raise PlanningError(
+            f"the goal {describe(aim)} is about what a belief does not know yet: give a Belief as context, such as "
+            "ft.Belief() or what ft.identify returns"
+        )
+    config = config or (LEARNING if learns else PlanConfig())
     own = _learned() if imaginer is None else imaginer
     second = checker if config.check else None
     if second is not None and second.action is not own.action:
@@ -129,7 +141,7 @@ def plan(
             f"the {own.name} imagines a {own.action.label}, the checker {second.name} a {second.action.label}: give "
             "two that imagine the same kind of action"
         )
-    if config.check and checker is None and own.action is first_action():
+    if config.check and checker is None and own.action is first_action() and not learns:
         second = _twin(scene.object)
     return Search(scene, aim, own, second, context, config, reach).run(T_table_object)
 

@@ -224,7 +224,19 @@ class Search:
     def _motions(self, imaginer: Imaginer, batch: ImaginedBatch, candidates: Candidates) -> Motions:
         check_outcomes(self.goal, batch.futures.outcome, imaginer.name)
         scene = self.scene
-        return Motions.of(batch, candidates.actions, scene.outline, scene.height, imaginer.rests)
+        found = Motions.of(batch, candidates.actions, scene.outline, scene.height, imaginer.rests)
+        if not self.goal.needs_gain() or not isinstance(self.context, Belief):
+            return found
+        from foretrace.monitoring.information import information_gain  # it imports scipy
+
+        gain = information_gain(
+            scene.view,
+            scene.in_view(candidates.actions),
+            self.context,
+            imaginer=self.imaginer,
+            com=scene.com_in_view,
+        )
+        return replace(found, gain=gain)
 
     def _score(self, motions: Motions) -> Scores:
         """What candidates are worth, from the frame of the goal."""

@@ -260,6 +260,10 @@ def _begin(seen: Any, goal: Any, steps: int, com: Numbers | None) -> tuple[Goal,
         )
     aim, scene = as_goal(goal), Scene.of(seen)
     aim.check(scene.outline)
+    if aim.needs_gain():
+        raise PlanningError(
+            f"the goal {describe(aim)} is about one action: plan it with ft.plan, ft.identify, and plan again"
+        )
     if LEVERED in aim.needed_outcomes():
         raise PlanningError(
             f"the goal {describe(aim)} is about an object that is {LEVERED}, a sequence ends with the object at rest: "

@@ -15,6 +15,7 @@ from foretrace.planning.goals.base import (
     as_goal,
     describe,
 )
+from foretrace.planning.goals.learning import Learn
 from foretrace.planning.goals.lifting import KeepUpright, Lift, Tilt, Tumble, TurnOver
 from foretrace.planning.goals.moving import Avoid, Move, MoveTo, SlideOff, Turn
 
@@ -26,6 +27,7 @@ __all__ = [
     "Constraint",
     "Goal",
     "KeepUpright",
+    "Learn",
     "Lift",
     "Move",
     "MoveTo",

@@ -51,6 +51,8 @@ class Goal(ABC):
     """Name on the command line and in files."""
     outcomes: ClassVar[tuple[str, ...]] = ()
     """Outcomes that an imaginer has to tell apart for the cost."""
+    asks_gain: ClassVar[bool] = False
+    """Whether it looks at `Motions.gain`, which a belief as context gives."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -83,6 +85,10 @@ class Goal(ABC):
         """Outcomes that an imaginer has to tell apart."""
         own = [*self.outcomes, *(name for each in self.constraints() for name in each.outcomes)]
         return tuple(dict.fromkeys(own))
+
+    def needs_gain(self) -> bool:
+        """Whether it can only be had with a belief, see `asks_gain`."""
+        return self.asks_gain
 
     def __add__(self, other: Any) -> "Total":
         return Total(_terms(self) + _terms(as_goal(other)))
@@ -127,6 +133,10 @@ class Total(Goal):
     def needed_outcomes(self) -> tuple[str, ...]:
         """Those of all."""
         return tuple(dict.fromkeys(name for _, goal in self.terms for name in goal.needed_outcomes()))
+
+    def needs_gain(self) -> bool:
+        """Whether any does."""
+        return any(goal.needs_gain() for _, goal in self.terms)
 
     def __str__(self) -> str:
         return " + ".join(
