@@ -39,8 +39,10 @@ class Slide(Imaginer):
     context = ("friction",)
     marginal = True
 
-    def __init__(self, of_friction: float = 1.0, of_contact: float = 0.0, slips: bool = False):
-        self.of_friction, self.of_contact, self.slips = of_friction, of_contact, slips
+    def __init__(
+        self, of_friction: float = 1.0, of_contact: float = 0.0, slips: bool = False, turns: bool = True
+    ):
+        self.of_friction, self.of_contact, self.slips, self.turns = of_friction, of_contact, slips, turns
 
     @property
     def sample_times(self) -> np.ndarray:
@@ -56,7 +58,7 @@ class Slide(Imaginer):
         ahead = 0.01 + ahead + (self.of_contact * contacts if self.of_contact else 0.0)
         com = np.repeat(scenes.com[:, None], len(times), axis=1)
         com[..., 0] += np.outer(ahead, phase)
-        futures = Futures.point(com, np.zeros_like(com), "levered")
+        futures = Futures.point(com, np.zeros_like(com) if self.turns else None, "levered")
         futures = replace(futures, spread=np.full((count, 1, len(times)), 1e-3))
         if self.slips:
             other = com.copy()
@@ -163,6 +165,7 @@ def test_the_same_seed_gives_the_same():
         (lambda: ft.plan_sequence(PRISM, goals.Learn(), 2, Slide(), ONE), PlanningError, "about one action"),
         (lambda: goals.Learn(at_least=-1.0), PlanningError, "at_least is -1.0"),
         (lambda: information_gain(VIEW, [], ONE, imaginer=Slide()), PredictionError, "no candidate"),
+        (lambda: gains(Slide(turns=False), ONE), MonitoringError, "positions alone"),
         (lambda: unchecked(VIEW, [], {"friction": 1}), MonitoringError, "belief of type dict"),
     ],
 )

@@ -81,7 +81,7 @@ class Identification(Experiment):
             raise ResultsError(f"objects is {self.objects}: give at least 1")
         if not 1 <= self.lever_ups <= LEARNED_FROM:
             raise ResultsError(f"lever_ups is {self.lever_ups}: give a number from 1 to {LEARNED_FROM}")
-        return [IdentificationTrial(k, choice) for choice in self.choices for k in range(self.objects)]
+        return [IdentificationTrial(k, choice) for k in range(self.objects) for choice in self.choices]
 
     def identity(self) -> dict[str, Any] | None:
         """The predictor, the seed, and what is learned from."""

@@ -78,7 +78,7 @@ def identify(
         What is believed after it. ``learned`` names what was learned; all else keeps its prior.
 
     Raises:
-        MonitoringError: An argument is of another type.
+        MonitoringError: An argument is of another type, or the imaginer imagines no rotations.
         PredictionError: The view or the motion cannot be used.
     """
     check_type("view", view, TopDownView, MonitoringError)
@@ -146,10 +146,15 @@ def log_likelihoods(
         poses: Poses of any frame of the object in the frame of the action as commanded.
         rotations: Their rotation vectors since rest [rad].
         width: Error of the imaginer [m].
+
+    Raises:
+        MonitoringError: Rotations were not imagined.
     """
     futures = played.futures
     world, slot = np.nonzero(futures.counted)
     states = futures.states[world, slot]
+    if not np.isfinite(states).all():
+        raise MonitoringError("the imaginer imagines positions alone: give one that imagines rotations, too")
     points = states[:, 0, :3]
     place = np.interp(times, played.times, np.arange(len(played.times)))
     k = np.minimum(place.astype(int), len(played.times) - 2)

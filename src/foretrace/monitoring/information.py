@@ -52,7 +52,7 @@ def information_gain(
         seed: Decides the draws, which are the same for all actions.
 
     Raises:
-        MonitoringError: An argument is of another type.
+        MonitoringError: An argument is of another type, or the imaginer imagines no rotations.
         PredictionError: The view does not show one object that such an action reaches.
     """
     check_type("view", view, TopDownView, MonitoringError)
