@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import foretrace as ft
 from foretrace.cli import main
@@ -12,9 +13,12 @@ from foretrace.experiments.executions import make_execution
 from foretrace.experiments.monitor_calibration import imagine
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined import LEVELS, Futures, ImaginedEffect
-from foretrace.monitoring import Drift, MonitorCalibration
+from foretrace.interactions.dataset import Dataset
+from foretrace.monitoring import Drift, MonitorCalibration, Verdict
 from foretrace.monitoring.causes import BAD_INPUT, FROZEN, LOST, CauseModel
 from foretrace.monitoring.motions import motions_of, place_of
+from foretrace.pictures.scene import Scene
+from foretrace.pictures.watched import monitor_film
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
@@ -389,8 +393,36 @@ def test_the_command_draws_what_a_monitor_would_have_said(tmp_path, capsys):
     assert out.stat().st_size > 10_000
     assert main([*arguments[:2], "99", *arguments[3:]]) == 2
     assert "has no interaction 99" in capsys.readouterr().err
-    assert main([*arguments[:4], "watched.gif"]) == 2
+    film = tmp_path / "watched.gif"
+    assert main([*arguments[:4], str(film), *arguments[5:]]) == 0
+    with Image.open(film) as moving:
+        assert moving.n_frames == len(Dataset.open(tmp_path / "data")[0].effect.times)
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "data", film, out]
+    assert main([*arguments[:4], "watched.tiff"]) == 2
     assert "choose a name that ends in" in capsys.readouterr().err
+
+
+def test_a_film_says_so_from_the_alarm_on(tmp_path):
+    """Before the alarm the title stands there, from it on the cause; the expected edges are drawn beside the object."""
+    prism = ft.sample_prism(np.random.default_rng(0), 5)
+    action = ft.LeverUp.at_edge(prism, 0)
+    effect = ft.simulate(prism, action, embodiment="tool")
+    imagined = ft.load_predictor().imagine(ft.TopDownView.of(prism, action), action)
+    verdict = Verdict(0.0, False, None, 0.5, 3.0, False, {"levered": 1.0}, {}, "")
+    verdicts = [
+        replace(verdict, time=float(t), alarm=bool(t > 1), cause="held" if t > 1 else None)
+        for t in effect.effect.times
+    ]
+    given = []
+    pictures = monitor_film(Scene.observed(effect), imagined, verdicts, tmp_path / "film.gif")
+    with Image.open(pictures) as moving:
+        for frame in range(moving.n_frames):
+            moving.seek(frame)
+            given.append(np.asarray(moving.convert("RGB"))[:28, :480])
+    first = int((effect.effect.times > 1).argmax())
+    assert (given[0] == given[first - 1]).all()
+    assert (given[first] == given[-1]).all()
+    assert (given[first] != given[first - 1]).any()
 
 
 # --- drift --------------------------------------------------------------------------------------------------------

@@ -1,4 +1,6 @@
-"""Draws docs/images/causes.png, what a monitor says of six faults, and docs/images/belief.png, what lever-ups tell.
+"""Draws what a monitor says of six faults, a film of one of them, and what lever-ups tell.
+
+The files are docs/images/causes.png, held.gif and belief.png.
 
     python docs/images/monitoring.py
 
@@ -6,6 +8,7 @@ Executions are the first ones of their kind, of a seed of their own, in which th
 centimetre.
 """
 
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -17,7 +20,10 @@ from matplotlib.figure import Figure
 import foretrace as ft
 from foretrace.experiments.executions import Execution, make_execution
 from foretrace.experiments.monitor_calibration import imagine
+from foretrace.geometry import pose_to_matrix
+from foretrace.pictures.scene import Scene
 from foretrace.pictures.style import GREY, INK, PREDICTION_COLORS, STYLE
+from foretrace.pictures.watched import monitor_film
 
 SEED = 401
 SHOWN = {
@@ -34,7 +40,8 @@ LOADED = (0.012, -0.008)
 
 
 def main() -> None:
-    """Draw both."""
+    """Draw all of them."""
+    draw_film()
     with mpl.rc_context(STYLE):
         fig = Figure(figsize=(11, 5.6), layout="constrained")
         for ax, (fault, title) in zip(fig.subplots(2, 3).ravel(), SHOWN.items(), strict=True):
@@ -65,6 +72,20 @@ def draw_score(ax: Axes, execution: Execution, title: str) -> None:
         ax.plot(first.time, max(first.score, 0.1), "o", color=PREDICTION_COLORS[0])
         later = [each.cause for each in verdicts if each.time <= first.time + 0.31][-1]
         ax.text(0.03, 0.9, f"{first.time:.2f} s: {later}", transform=ax.transAxes, color=PREDICTION_COLORS[0])
+
+
+def draw_film() -> None:
+    """The object that is held at a corner, while the monitor watches."""
+    found = (make_execution(SEED, number, "fixed") for number in count())
+    held = next(each for each in found if each.deviation[-1] > LEAST)
+    imagined = imagine(held, "worlds")
+    monitor = ft.Monitor(imagined)
+    verdicts = [monitor.update(float(t), pose) for t, pose in zip(held.times, held.tracked, strict=True)]
+    frames = pose_to_matrix(held.poses)
+    com = frames[:, :3, :3] @ held.object.mass_properties(1.0).com + frames[:, :3, 3]
+    scene = Scene.imagined(held.object, held.action, held.times, {}, held.poses)
+    scene = replace(scene, com=com, title="An object that is held at one corner")
+    monitor_film(scene, imagined, verdicts, HERE / "held.gif")
 
 
 def draw_beliefs(axes: list[Axes]) -> None:

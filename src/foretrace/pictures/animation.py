@@ -3,7 +3,7 @@
 Matplotlib draws once what stays the same, diagrams and legends; what moves is drawn onto it, which takes milliseconds.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -97,37 +98,59 @@ def write_animation(path: Path, pictures: Iterator[np.ndarray], period: float) -
     return path
 
 
-def frames(scene: Scene, width: int = 960, height: int = 450) -> Iterator[np.ndarray]:
-    """One (height, width, 3) uint8 picture for each sample of a scene."""
+def frames(
+    scene: Scene,
+    width: int = 960,
+    height: int = 450,
+    diagrams: Callable[[list[Axes], Scene], None] = draw_over_time,
+    news: tuple[int, str] | None = None,
+) -> Iterator[np.ndarray]:
+    """One (height, width, 3) uint8 picture for each sample of a scene.
+
+    Args:
+        scene: What is shown.
+        width: Width [pixels].
+        height: Height [pixels].
+        diagrams: Draws over time into three axes.
+        news: A sample, and what takes the title's place from there on.
+    """
     with mpl.rc_context(STYLE):
         fig = Figure(figsize=(width / 100, height / 100), dpi=100)
         canvas = FigureCanvasAgg(fig)
         handles = legend_of(scene)
         grid = fig.add_gridspec(3, 2, width_ratios=[1.7, 1.0], left=0.01, right=0.985, bottom=0.24, top=0.88)
         axes = [fig.add_subplot(grid[k, 1]) for k in range(3)]
-        draw_over_time(axes, scene)
+        diagrams(axes, scene)
         for ax in axes:
             ax.set_xlim(float(scene.times[0]), max(float(scene.times[-1]), float(scene.times[0]) + 0.05))
-        fig.suptitle(scene.title, x=0.015, ha="left", fontsize=12, fontweight="bold")
+        title = fig.suptitle(scene.title, x=0.015, ha="left", fontsize=12, fontweight="bold")
         fig.legend(handles=handles, loc="lower left", fontsize=8.5, ncols=1 if len(handles) < 3 else 2)
         stage = fig.add_axes((0.01, 0.15, 0.56, 0.78))
         (x0, x1), (y0, y1) = _limits(scene)
         stage.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", anchor="C")
         stage.axis("off")
-        canvas.draw()
-        still = np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+        stills = [_drawn(canvas)]
+        if news is not None:
+            title.set(text=news[1], color=PREDICTION_COLORS[0])
+            stills.append(_drawn(canvas))
         origin, one = stage.transData.transform([[0.0, 0.0], [1.0, 1.0]])
         shown = _Stage(scene, one - origin, origin, (height, int(stage.bbox.extents[2])))
         bars = [ax.bbox.extents for ax in axes]
-    shown.draw_table(still)
+    for still in stills:
+        shown.draw_table(still)
     low, high = axes[0].get_xlim()
     for k, time in enumerate(scene.times):
-        picture = still.copy()
+        picture = stills[news is not None and k >= news[0]].copy()
         shown.draw(picture, k)
         for left, bottom, right, top in bars:
             column = left + (right - left) * (time - low) / (high - low)
             _line(picture, np.array([[column, height - top], [column, height - bottom]]), INK, 1)
         yield picture
+
+
+def _drawn(canvas: FigureCanvasAgg) -> np.ndarray:
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
 
 def project(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

@@ -1,6 +1,8 @@
-"""The picture of an execution that a monitor watched: score against threshold, outcomes, height."""
+"""Picture and film of an execution that a monitor watched: score against threshold, outcomes, height."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +11,8 @@ from matplotlib.figure import Figure
 
 from foretrace.imagined import ImaginedEffect
 from foretrace.monitoring import Verdict
+from foretrace.pictures.animation import frames, write_animation
+from foretrace.pictures.scene import Ghost, Scene
 from foretrace.pictures.style import (
     CM,
     GREY,
@@ -40,9 +44,86 @@ def monitor_figure(
         com: Observed centre of mass at each sample, in the action frame [m]; NaN where it was not tracked.
         title: Title.
     """
-    times = np.array([each.time for each in verdicts])
     fig = new_figure(7.2, 7.0)
-    score, outcomes, height = fig.subplots(3, 1, sharex=True, height_ratios=(3, 2, 3))
+    axes = list(fig.subplots(3, 1, sharex=True, height_ratios=(3, 2, 3)))
+    _draw_verdicts(axes, imagined, verdicts, com)
+    alarm = _alarm(verdicts)
+    if alarm is not None:
+        last, top = verdicts[-1].cause, axes[0].get_ylim()[1]
+        words = _words(alarm)
+        words += "" if last == alarm.cause else f", in the end: {last}"
+        axes[0].text(alarm.time, top, f" {words}", va="top", color=PREDICTION_COLORS[0])
+    for each in axes:
+        each.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    headline(fig, title)
+    return fig
+
+
+def monitor_film(
+    scene: Scene, imagined: ImaginedEffect, verdicts: Sequence[Verdict], path: str | Path
+) -> Path:
+    """Write the execution as a GIF or MP4 in real time: the object, where it was expected, and score over time.
+
+    Args:
+        scene: The execution; its samples are those of the verdicts.
+        imagined: What was imagined.
+        verdicts: The verdict at each sample.
+        path: The file to write; its ending decides between ``.gif`` and ``.mp4``.
+
+    Raises:
+        PredictionError: The ending is unknown, or MP4 cannot be written here.
+    """
+    expected = imagined.object_poses(scene.placement)
+    ghosts = (
+        ()
+        if expected is None
+        else (Ghost(_at(scene.times, imagined.times, expected), PREDICTION_COLORS[0], 1.0),)
+    )
+    scene = replace(scene, predictions={"imagined": imagined.com_trajectory}, ghosts=ghosts)
+    com = scene.com
+    assert com is not None
+
+    def diagrams(axes: list[Axes], _: Scene) -> None:
+        _draw_verdicts(axes, imagined, verdicts, com)
+        for ax in axes[:2]:
+            ax.tick_params(labelbottom=False)
+        axes[0].set_title("score, outcomes, height", fontsize=9)
+        axes[1].legend(loc="center left", fontsize=7)
+        for ax in axes:
+            ax.set_ylabel(ax.get_ylabel(), fontsize=7.5)
+
+    alarm = _alarm(verdicts)
+    news = None if alarm is None else (verdicts.index(alarm), _words(alarm).capitalize())
+    period = float(np.median(np.diff(scene.times))) if len(scene.times) > 1 else 0.05
+    return write_animation(Path(path), frames(scene, height=500, diagrams=diagrams, news=news), period)
+
+
+def _alarm(verdicts: Sequence[Verdict]) -> Verdict | None:
+    return next((each for each in verdicts if each.alarm), None)
+
+
+def _words(alarm: Verdict) -> str:
+    return f"alarm at {alarm.time:.2f} s: {alarm.cause}"
+
+
+def _at(
+    times: Float[np.ndarray, " samples"],
+    own: Float[np.ndarray, " time"],
+    poses: Float[np.ndarray, "time 7"],
+) -> Float[np.ndarray, "samples 7"]:
+    """Poses at the nearest of their own times."""
+    return poses[np.abs(times[:, None] - own).argmin(axis=1)]
+
+
+def _draw_verdicts(
+    axes: list[Axes],
+    imagined: ImaginedEffect,
+    verdicts: Sequence[Verdict],
+    com: Float[np.ndarray, "time 3"],
+) -> None:
+    """Score, outcomes and height over time, one below the other, and when there was an alarm."""
+    score, outcomes, height = axes
+    times = np.array([each.time for each in verdicts])
     values = np.array([each.score for each in verdicts])
     score.plot(times, values, color=PREDICTION_COLORS[0], label="score")
     score.axhline(verdicts[0].threshold, color=INK, linestyle="--", linewidth=1.0, label="threshold")
@@ -56,18 +137,10 @@ def monitor_figure(
     outcomes.set_ylim(-0.03, 1.03)
     outcomes.set_ylabel("probability")
     _draw_height(height, imagined, times, com)
-    alarm = next((each for each in verdicts if each.alarm), None)
+    alarm = _alarm(verdicts)
     if alarm is not None:
-        for axes in (score, outcomes, height):
-            axes.axvline(alarm.time, color=PREDICTION_COLORS[0], linewidth=1.0)
-        last = verdicts[-1].cause
-        words = f"alarm at {alarm.time:.2f} s: {alarm.cause}"
-        words += "" if last == alarm.cause else f", in the end: {last}"
-        score.text(alarm.time, score.get_ylim()[1], f" {words}", va="top", color=PREDICTION_COLORS[0])
-    for axes in (score, outcomes, height):
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-    headline(fig, title)
-    return fig
+        for ax in axes:
+            ax.axvline(alarm.time, color=PREDICTION_COLORS[0], linewidth=1.0)
 
 
 def _draw_height(
@@ -84,7 +157,7 @@ def _draw_height(
     axes.plot(
         imagined.times,
         CM * imagined.com_trajectory[:, 2],
-        color=PREDICTION_COLORS[1],
+        color=PREDICTION_COLORS[0],
         linestyle="--",
         label="imagined",
     )
