@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from foretrace.errors import StudioError
+from foretrace.studio.heaps import share_heaps
 
 
 def studio(
@@ -38,11 +39,12 @@ def studio(
         raise StudioError(
             f"--onnxruntime-web {onnxruntime_web} is of no use without --export: add it, or leave it out"
         )
+    check_port(port)
+    share_heaps()
     from foretrace.interactions.dataset import Dataset
     from foretrace.studio.choices import Choices
     from foretrace.studio.server import StudioServer
 
-    check_port(port)
     choices = Choices.from_text(at)
     served = StudioServer(host, port, choices, None if data is None else Dataset.open(data), dark)
     try:
@@ -63,6 +65,7 @@ def serve(host: str = "127.0.0.1", port: int = 8000) -> None:
         port: Port to listen at; 0: any that is free.
     """
     check_port(port)
+    share_heaps()
     from foretrace.studio.service import serve
 
     serve(host, port)
