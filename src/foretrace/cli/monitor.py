@@ -1,27 +1,59 @@
 """The command that watches a recorded action as a monitor would have watched it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tyro.conf import Positional
+from jaxtyping import Float
+from tyro.conf import OmitArgPrefixes, Positional
 
 from foretrace.errors import DatasetError, MonitoringError
 from foretrace.files import atomic_path
-from foretrace.imagined import Belief
+from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
+from foretrace.imagined import Belief, ImaginedEffect
 from foretrace.interactions.dataset import Dataset
-from foretrace.monitoring import Monitor
+from foretrace.monitoring import Monitor, Verdict
 from foretrace.pictures.scene import Scene
 from foretrace.pictures.watched import monitor_figure, monitor_film
+from foretrace.planning import Plan
 from foretrace.predictor import load_imaginer
 
 PICTURES, FILMS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
+@dataclass(frozen=True)
+class TrackOptions:
+    """Poses of a tracker, for a plan."""
+
+    poses: Path | None = None
+    """Table of poses (CSV) or bag of ROS, from the beginning of the action on."""
+    topic: str | None = None
+    """Topic of the poses in a bag; needed if several have poses."""
+    child: str = "object"
+    """Frame of the object, where a bag has transforms."""
+    table: bool = False
+    """The poses are in the table frame of the plan; otherwise in the action frame."""
+    start: float | None = None
+    """Time at which the action began, by the clock of the poses [s]; by default that of the first one."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Watched:
+    """What happened, and what a monitor said of it."""
+
+    scene: Scene
+    imagined: ImaginedEffect
+    verdicts: list[Verdict]
+    com: Float[np.ndarray, "samples 3"]
+    """Observed centre of mass, NaN where the object was lost."""
+
+
 def monitor(
     data: Positional[Path],
-    id: Positional[int],
+    id: Positional[int | None] = None,
+    *,
     out: Path,
+    track: OmitArgPrefixes[TrackOptions] = TrackOptions(),
     run: Path | None = None,
     false_alarms: float = 0.05,
     calibration: Path | None = None,
@@ -29,14 +61,17 @@ def monitor(
 ) -> None:
     """Watch a recorded or simulated action, sample by sample, as a monitor would have watched it under way.
 
+    It is an interaction of a data set, or a plan with the poses that a tracker recorded while it was carried out.
+
     Writes an image of the score over time with its threshold, of the outcomes' probabilities, and of the height as
     imagined and observed, or a film in which the object moves beside them, with its expected edges; and prints when
     there was an alarm, and why.
 
     Args:
-        data: Folder of the data set.
+        data: Folder of the data set, or a plan.json.
         id: Number of the interaction.
         out: The image to write: .png, .svg or .pdf; or the film: .gif or .mp4.
+        track: Poses, for a plan.
         run: Folder of the training; by default the predictor that comes with foretrace.
         false_alarms: Share of whole normal executions that may alarm.
         calibration: File of another calibration than the one that comes with foretrace.
@@ -46,6 +81,36 @@ def monitor(
         raise MonitoringError(
             f"cannot draw into {out}: choose a name that ends in {', '.join(PICTURES + FILMS)}"
         )
+    belief = Belief(worlds=worlds)
+    if data.suffix.lower() == ".json":
+        if id is not None or track.poses is None:
+            raise MonitoringError(f"{data} is a plan: give --poses FILE, and no number of an interaction")
+        watched = _watch_plan(data, track, run, belief, false_alarms, calibration)
+    else:
+        if id is None or track != TrackOptions():
+            raise MonitoringError(
+                f"{data} is a data set: give the number of an interaction, and no options of poses, which belong to a "
+                "plan.json"
+            )
+        watched = _watch_interaction(data, id, run, belief, false_alarms, calibration)
+    with atomic_path(out) as temporary:
+        if out.suffix.lower() in FILMS:
+            film = temporary.with_name(f"{temporary.name}{out.suffix}")
+            monitor_film(watched.scene, watched.imagined, watched.verdicts, film).replace(temporary)
+        else:
+            figure = monitor_figure(watched.imagined, watched.verdicts, watched.com, watched.scene.title)
+            figure.savefig(temporary, format=out.suffix[1:].lower())
+    alarm, last = next((each for each in watched.verdicts if each.alarm), None), watched.verdicts[-1]
+    if alarm is None:
+        print(f"no alarm: score {last.score:.2f} of {last.threshold:.2f}; {last.message}")
+    else:
+        print(f"alarm at {alarm.time:.2f} s: {alarm.cause}; in the end: {last.message}")
+    print(out)
+
+
+def _watch_interaction(
+    data: Path, id: int, run: Path | None, belief: Belief, false_alarms: float, calibration: Path | None
+) -> _Watched:
     dataset = Dataset.open(data)
     rows = np.flatnonzero(dataset.index["id"].to_numpy() == id)
     if len(rows) == 0:
@@ -54,24 +119,63 @@ def monitor(
     effect = interaction.effect
     if len(effect.times) == 0:
         raise MonitoringError(f"interaction {id} has no samples: choose one that did not fail")
-    imagined = load_imaginer(run).imagine(interaction.view, interaction.action, context=Belief(worlds=worlds))
-    watched = Monitor(imagined, false_alarms, calibration=calibration)
+    imagined = load_imaginer(run).imagine(interaction.view, interaction.action, context=belief)
+    watching = Monitor(imagined, false_alarms, calibration=calibration)
     verdicts = [
-        watched.update(float(t), pose) for t, pose in zip(effect.times, effect.pose_trajectory, strict=True)
+        watching.update(float(t), pose) for t, pose in zip(effect.times, effect.pose_trajectory, strict=True)
     ]
-    alarm = next((each for each in verdicts if each.alarm), None)
-    title = f"Interaction {id}: {effect.outcome}"
-    with atomic_path(out) as temporary:
-        if out.suffix.lower() in FILMS:
-            film = temporary.with_name(f"{temporary.name}{out.suffix}")
-            scene = replace(Scene.observed(interaction), title=title)
-            monitor_film(scene, imagined, verdicts, film).replace(temporary)
-        else:
-            figure = monitor_figure(imagined, verdicts, effect.com_trajectory, title)
-            figure.savefig(temporary, format=out.suffix[1:].lower())
-    last = verdicts[-1]
-    if alarm is None:
-        print(f"no alarm: score {last.score:.2f} of {last.threshold:.2f}; {last.message}")
-    else:
-        print(f"alarm at {alarm.time:.2f} s: {alarm.cause}; in the end: {last.message}")
-    print(out)
+    scene = replace(Scene.observed(interaction), title=f"Interaction {id}: {effect.outcome}")
+    return _Watched(scene, imagined, verdicts, effect.com_trajectory)
+
+
+def _watch_plan(
+    file: Path,
+    track: TrackOptions,
+    run: Path | None,
+    belief: Belief,
+    false_alarms: float,
+    calibration: Path | None,
+) -> _Watched:
+    from foretrace.perception.pose_files import read_poses
+
+    assert track.poses is not None
+    plan = Plan.open(file)
+    T_table_action = plan.T_table_action if track.table else None
+    if track.table and T_table_action is None:
+        raise MonitoringError(
+            f"{file} does not say where the object lies on the table: plan with --pose or --photo, or give poses in "
+            "the action frame"
+        )
+    times, poses = read_poses(track.poses, track.topic, track.child)
+    times = times - (times[0] if track.start is None else track.start)
+    if not (kept := times >= -1e-9).any():
+        raise MonitoringError(
+            f"--start {track.start:g} is after the last pose: give a time by the clock of the poses"
+        )
+    times, poses = times[kept], poses[kept]
+    lost = np.isnan(poses[:, 0])
+    if lost.all():
+        raise MonitoringError(
+            f"{track.poses} has no pose after the beginning of the action: record it while it runs"
+        )
+    plan = plan.imagined_by(load_imaginer(run), belief)
+    watching = Monitor(plan, false_alarms, T_table_action=T_table_action, calibration=calibration)
+    verdicts = [
+        watching.update(float(t), None if gone else pose)
+        for t, pose, gone in zip(times, poses, lost, strict=True)
+    ]
+    # Whichever frame of the object is tracked: it has moved from where the plan saw the object at rest.
+    seen = pose_to_matrix(poses[np.maximum.accumulate(np.where(lost, np.argmin(lost), np.arange(len(lost))))])
+    if T_table_action is not None:
+        seen = invert_transform(T_table_action) @ seen
+    moved = seen @ invert_transform(seen[0])
+    rest, middle = plan.action.T_action_object, plan.imagined.com_trajectory[:1]
+    com = np.array([transform_points(each, middle)[0] for each in moved])
+    obj = plan.object
+    if obj is None:
+        from foretrace.objects import Prism
+
+        obj = Prism(plan.outline, plan.height)
+    scene = Scene.imagined(obj, plan.action, times, {}, matrix_to_pose(moved @ rest))
+    scene = replace(scene, com=com, title=f"{plan.goal}: {track.poses.name}")
+    return _Watched(scene, plan.imagined, verdicts, np.where(lost[:, None], np.nan, com))

@@ -69,17 +69,17 @@ def open_bag(path: Path, topic: str | None = None, depth_topic: str | None = Non
     Raises:
         PerceptionError: The bag is damaged or has no such topic, or rosbags is not installed.
     """
-    with _reader(path) as reader:
+    with open_reader(path) as reader:
         streams = _streams(reader, path)
         colours = [name for name, stream in streams.items() if not stream.depth]
         depths = [name for name, stream in streams.items() if stream.depth]
         if not streams:
             raise PerceptionError(f"bag {path} has no image topic: it has {_contents(reader)}")
-        colour = _chosen(path, topic, colours, "image topic", "--topic")
+        colour = choose_topic(path, topic, colours, "image topic", "--topic")
         frame = streams[colour].frame
         aligned = [name for name in depths if streams[name].frame == frame and (frame or name == depth_topic)]
         if depth_topic is not None or len(aligned) > 1:
-            depth_topic = _chosen(path, depth_topic, depths, "depth topic", "--depth-topic")
+            depth_topic = choose_topic(path, depth_topic, depths, "depth topic", "--depth-topic")
             if depth_topic not in aligned:
                 raise PerceptionError(
                     f"bag {path}: {depth_topic} is in frame {shown(streams[depth_topic].frame)}, {colour} in "
@@ -94,7 +94,7 @@ def _streams(reader: Any, path: Path) -> dict[str, _Stream]:
     """The topics with images, each by its first message; those without a message are left out."""
     found: dict[str, _Stream] = {}
     for topic in sorted({c.topic for c in reader.connections if c.msgtype in IMAGES}):
-        for _, _, message in _messages(reader, path, [topic]):
+        for _, _, message in read_messages(reader, path, [topic]):
             found[topic] = _Stream(is_depth(message), message.header.frame_id, message)
             break
     return found
@@ -107,7 +107,7 @@ def _contents(reader: Any) -> str:
     return f"{shown}{' and more' if len(topics) > 4 else ''}; record images raw or as JPEG or PNG"
 
 
-def _chosen(path: Path, asked: str | None, topics: list[str], kind: str, option: str) -> str:
+def choose_topic(path: Path, asked: str | None, topics: list[str], kind: str, option: str) -> str:
     """The topic that was asked for, or the only one."""
     if asked is None and len(topics) == 1:
         return topics[0]
@@ -119,7 +119,7 @@ def _chosen(path: Path, asked: str | None, topics: list[str], kind: str, option:
 
 
 @contextmanager
-def _reader(path: Path) -> Iterator[Any]:
+def open_reader(path: Path) -> Iterator[Any]:
     """An open reader of a bag."""
     try:
         from rosbags.highlevel import AnyReader
@@ -176,7 +176,7 @@ def _damaged(path: Path, error: Exception) -> PerceptionError:
     return PerceptionError(f"bag {path} cannot be read ({' '.join(str(error).split())[:120]}): {remedy}")
 
 
-def _messages(reader: Any, path: Path, topics: list[str]) -> Iterator[tuple[str, float, Any]]:
+def read_messages(reader: Any, path: Path, topics: list[str]) -> Iterator[tuple[str, float, Any]]:
     """The messages of some topics in the order of their recording: topic, time of recording [s], content."""
     connections = [c for c in reader.connections if c.topic in topics]
     try:
@@ -192,7 +192,7 @@ def _camera(reader: Any, path: Path, topic: str, stream: _Stream) -> tuple[Pinho
     """The camera of an image topic, or why it is not known."""
     infos = []
     for name in sorted({c.topic for c in reader.connections if c.msgtype == CAMERA_INFO}):
-        infos += [Info(name, message) for _, _, message in islice(_messages(reader, path, [name]), 1)]
+        infos += [Info(name, message) for _, _, message in islice(read_messages(reader, path, [name]), 1)]
     rows, columns = read_colour(stream.first, path).shape[:2]
     try:
         return camera_of(Images(topic, stream.frame, (columns, rows)), infos), ""
@@ -210,8 +210,8 @@ def _frames(path: Path, colour: str, depth: str | None) -> Iterator[Frame]:
         nearest = min(near, key=lambda one: abs(one[0] - frame.time), default=(0.0, None))
         return Frame(frame.time, frame.image, nearest[1])
 
-    with _reader(path) as reader:
-        for topic, recorded, message in _messages(
+    with open_reader(path) as reader:
+        for topic, recorded, message in read_messages(
             reader, path, [colour] if depth is None else [colour, depth]
         ):
             stamp = message.header.stamp

@@ -1,0 +1,125 @@
+"""Poses of trackers: tables, bags of ROS, and a plan that is watched with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import foretrace as ft
+from export_samples import fake_data
+from foretrace.cli import main
+from foretrace.errors import PerceptionError
+from foretrace.export.episodes import choose
+from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
+from foretrace.interactions.dataset import Dataset
+from foretrace.perception.pose_files import COLUMNS, read_poses
+
+HEAD = ",".join(COLUMNS)
+ROWS = ("0.5,0.1,0,0,1,0,0,0", "0.6,,,,,,,", "0.7,0.12,0,0.01,0.8,0.6,0,0")
+PRISM = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\n".join([HEAD, *ROWS]),
+        "\r\n".join(["t,X,y,z,qw,qx,qy,qz", *ROWS, ""]),
+        "\n".join(row.replace(",", ";").replace(".", ",") for row in (HEAD, *ROWS)),
+        "\n".join(f"{row},{k}" for k, row in enumerate([HEAD, *ROWS])),
+    ],
+    ids=["as it is", "other names", "decimal commas", "one more column"],
+)
+def test_tables_are_read_and_empty_cells_are_lost_poses(tmp_path: Path, text: str):
+    file = tmp_path / "poses.csv"
+    file.write_text(text, encoding="utf-8", newline="")
+    times, poses = read_poses(file)
+    np.testing.assert_array_equal(times, [0.5, 0.6, 0.7])
+    np.testing.assert_array_equal(poses[[0, 2]], [[0.1, 0, 0, 1, 0, 0, 0], [0.12, 0, 0.01, 0.8, 0.6, 0, 0]])
+    assert np.isnan(poses[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["time_s,x_m"], "has no column y_m, z_m, qw, qx, qy, qz"),
+        ([HEAD], "has no pose"),
+        ([""], "has no column"),
+        ([HEAD, ROWS[2], ROWS[0]], "time 0.5 s follows 0.7 s"),
+        ([HEAD, ROWS[0].replace("0.1", "here")], "line 2: 'here' is no number"),
+        ([HEAD, ROWS[0].replace("0.1", "inf")], "line 2: inf is not finite"),
+        ([HEAD, ROWS[0].replace("0.5", "")], "a line has no time"),
+    ],
+)
+def test_tables_that_cannot_be_used_are_refused(tmp_path: Path, lines: list[str], message: str):
+    file = tmp_path / "poses.csv"
+    file.write_text("\n".join(lines))
+    with pytest.raises(PerceptionError, match=message):
+        read_poses(file)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_transforms_in_bags_are_the_poses_that_were_exported(tmp_path: Path, version: int):
+    rosbag = pytest.importorskip("foretrace.export.rosbag", reason="no rosbags")
+    data = fake_data(tmp_path / "data")
+    rosbag.export_rosbags(choose(data, [1]), tmp_path / "bags", version, camera=False)
+    (bag,) = (each for each in (tmp_path / "bags").iterdir() if each.name.startswith("interaction"))
+    effect = Dataset.open(data).with_id(1).effect
+    times, poses = read_poses(bag)
+    np.testing.assert_allclose(times - rosbag.START, effect.times, atol=1e-6)
+    np.testing.assert_allclose(pose_to_matrix(poses), pose_to_matrix(effect.pose_trajectory), atol=1e-9)
+    with pytest.raises(PerceptionError, match="has no frame 'hand': name one of object, tool"):
+        read_poses(bag, child="hand")
+    with pytest.raises(PerceptionError, match="no topic with poses /here"):
+        read_poses(bag, "/here")
+
+
+def test_stamped_poses_in_bags_are_read(tmp_path: Path):
+    pytest.importorskip("rosbags", reason="no rosbags")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    make = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/tracked", make["PoseStamped"].__msgtype__, typestore=store)
+        for k in range(3):
+            header = make["Header"](stamp=make["Time"](sec=7, nanosec=100_000_000 * k), frame_id="table")
+            pose = make["Pose"](
+                position=make["Point"](x=0.1 * k, y=0.2, z=0.3),
+                orientation=make["Quaternion"](x=0.6, y=0.0, z=0.0, w=0.8),
+            )
+            message = make["PoseStamped"](header=header, pose=pose)
+            writer.write(topic, 9_000_000_000 + k, store.serialize_cdr(message, message.__msgtype__))
+    times, poses = read_poses(tmp_path / "bag")
+    np.testing.assert_allclose(times, [7.0, 7.1, 7.2])
+    np.testing.assert_allclose(poses, [[0.1 * k, 0.2, 0.3, 0.8, 0.6, 0, 0] for k in range(3)])
+
+
+def test_a_plan_is_watched_with_poses_in_either_frame(tmp_path: Path, capsys, monkeypatch):
+    """The same motion in the action frame, late by the clock, and in the table frame gives the same score."""
+    monkeypatch.chdir(tmp_path)
+    T_table_object = planar_transform([0.3, 0.1, 0.0], 0.4)
+    config = ft.PlanConfig(check=0, refine=0, spacing=0.05)
+    plan = ft.plan(PRISM, ft.goals.Lift(), config=config, T_table_object=T_table_object)
+    plan.save("plan.json")
+    effect = ft.simulate(PRISM, plan.action, embodiment="tool").effect
+    on_table = matrix_to_pose(plan.T_table_action @ pose_to_matrix(effect.pose_trajectory))
+    for name, shift, poses in (("own", 100.0, effect.pose_trajectory), ("table", 0.0, on_table)):
+        table = np.column_stack([effect.times + shift, poses])
+        np.savetxt(f"{name}.csv", table, delimiter=",", header=HEAD, comments="")
+    said = []
+    for words in (["own.csv"], ["table.csv", "--table"]):
+        command = ["monitor", "plan.json", "--poses", *words, "--worlds", "16", "--out", "watched.png"]
+        assert main(command) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1]
+    assert said[0].startswith("no alarm")
+    for words, wrong in (
+        (["--poses", "table.csv"], "give poses in the action frame"),
+        (["--poses", "own.csv", "--start", "300"], "--start 300 is after the last pose"),
+        (["--poses", "none.csv"], "none.csv"),
+        ([], "is a plan: give --poses FILE"),
+        (["3", "--poses", "own.csv"], "is a plan: give --poses FILE, and no number"),
+    ):
+        assert main(["monitor", "plan.json", *words, "--worlds", "16", "--out", "watched.png"]) == 2
+        assert wrong in " ".join(capsys.readouterr().err.split())
