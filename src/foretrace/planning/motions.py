@@ -1,7 +1,7 @@
 """What goals look at: imagined motions of many actions, in the object's own frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,7 +42,7 @@ class Motions:
     """Outline of the object at rest [m], counter-clockwise."""
     height: float
     """Its height [m]."""
-    gain: Float[np.ndarray, " batch"] | None = None
+    gain: Float[np.ndarray, " batch"] | None = field(default=None, kw_only=True)
     """Information that each action is expected to give about the object's constants, where a goal asks for it [nat]."""
 
     @classmethod
@@ -129,7 +129,7 @@ class Motions:
             self.end + 1,
             self.outline,
             self.height,
-            self.gain,
+            gain=self.gain,
         )
 
     def moved_on(self, by: Float[np.ndarray, "batch 3"]) -> "Motions":
