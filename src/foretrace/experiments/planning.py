@@ -366,7 +366,7 @@ def _as_motions(played: Sequence[Interaction], actions: Sequence[Action], scene:
     return Certain(**vars(motions), happened=np.array([names.index(name) for name in outcomes]), names=names)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Certain(Motions):
     """Motions that happened, with the outcome of each."""
 
