@@ -124,7 +124,11 @@ def lightning_steps(label: str, config: LstmConfig, repeats: int) -> list[float]
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer = pl.Trainer(
-            max_epochs=1, accelerator="cpu", default_root_dir=folder, enable_progress_bar=False
+            max_epochs=1,
+            accelerator="cpu",
+            default_root_dir=folder,
+            enable_progress_bar=False,
+            enable_model_summary=False,
         )
         trainer.fit(Module(), DataLoader(data, batch_size=BATCH, shuffle=True))
     return seconds
