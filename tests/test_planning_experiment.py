@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import foretrace as ft
+from foretrace.errors import ResultsError
 from foretrace.experiments import planning
-from foretrace.experiments.planning import BELIEVED, Planning, PlanningTrial
+from foretrace.experiments.planning import BELIEVED, FAMILIES, Planning, PlanningTrial
+from foretrace.interactions.recording_folder import write_image
 from foretrace.interactions.topdown import TopDownView
 
 
@@ -28,3 +30,15 @@ def test_one_lever_up_in_the_other_world_is_learned_from(monkeypatch: pytest.Mon
     rows = np.searchsorted(good.effect.times, motion.times)
     off = np.linalg.norm(motion.poses[:, :3] - good.effect.pose_trajectory[rows, :3], axis=1)
     assert 0 < off.max() < 0.002, "as a tracker sees it"
+
+
+def test_silhouettes_are_a_family_where_there_are_pictures_of_them(tmp_path):
+    disc = np.hypot(*np.mgrid[-60:60, -60:60]) < 40
+    write_image(tmp_path / "disc.png", np.repeat(255 * disc[..., None], 3, axis=2).astype(np.uint8))
+    given, none = (Planning(objects=2, silhouettes=folder) for folder in (tmp_path, None))
+    assert {each.family for each in none.trials()} == {"polygon", "outline", "box"}
+    assert {each.family for each in given.trials()} == {*FAMILIES}
+    case = given._draw(PlanningTrial("silhouette", 1), np.random.default_rng(0))
+    assert 0.9 < case.obj.corners.max() / -case.obj.corners.min() < 1.1, "the disc"
+    with pytest.raises(ResultsError, match="needs pictures: give their folder with --silhouettes"):
+        replace(none, families=("silhouette",)).trials()

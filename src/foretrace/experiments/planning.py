@@ -25,6 +25,7 @@ from foretrace.experiments import SUMMARIES
 from foretrace.experiments.executions import track
 from foretrace.experiments.planning_report import GOALS, METHODS, draw, report_of, summary_of
 from foretrace.experiments.planning_rules import ClosedForm, choose_by_rule
+from foretrace.experiments.transfer_objects import Subject, read_silhouettes
 from foretrace.files import short_hash
 from foretrace.imagined import Belief, Futures, ImaginedBatch, Imaginer, ObservedMotion, estimate_com
 from foretrace.imagined.observed import rotations_since_rest
@@ -44,8 +45,9 @@ from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.recipes import ROUND
 from foretrace.twin import TwinConfig, TwinImaginer
 
-FAMILIES = ("polygon", "outline", "box")
-"""The paper's prisms; round, organic and dented outlines; boxes."""
+SILHOUETTE = "silhouette"
+FAMILIES = ("polygon", "outline", "box", SILHOUETTE)
+"""The paper's prisms; round, organic and dented outlines; boxes; silhouettes of real objects."""
 WORLDS = ("nominal", "other")
 LEAST_FREE = 12
 """An object with fewer free contacts is drawn anew."""
@@ -75,6 +77,8 @@ class Planning(Experiment):
     """Objects of each family. 0: nothing is run, results that are there are drawn again."""
     families: tuple[str, ...] = ()
     """Which families; by default all."""
+    silhouettes: Path | None = None
+    """Folder of pictures of silhouettes, which are a further family; without one, it is left out."""
     worlds: tuple[str, ...] = WORLDS
     """Which truths."""
     contacts: int = 40
@@ -95,7 +99,12 @@ class Planning(Experiment):
 
     def trials(self) -> Sequence[PlanningTrial]:
         """Object by object, the families in turn."""
-        families = chosen("family", self.families, FAMILIES)
+        if SILHOUETTE in self.families and self.silhouettes is None:
+            raise ResultsError(
+                f"the family {SILHOUETTE} needs pictures: give their folder with --silhouettes"
+            )
+        some = FAMILIES if self.silhouettes is not None else FAMILIES[:-1]
+        families = chosen("family", self.families, some)
         return [PlanningTrial(family, number) for number in range(self.objects) for family in families]
 
     def identity(self) -> dict[str, Any] | None:
@@ -202,6 +211,8 @@ class Planning(Experiment):
                 obj: ObjectModel = sample_prism(rng, 3 + trial.number % 8)
             elif trial.family == "box":
                 obj = sample_box(rng)
+            elif trial.family == SILHOUETTE:
+                obj = self._subjects[trial.number % len(self._subjects)].obj
             else:
                 obj = list(ROUND.values())[trial.number % len(ROUND)](rng)
             angle, physics = rng.uniform(0, 2 * np.pi), _draw_physics(rng)
@@ -221,6 +232,11 @@ class Planning(Experiment):
         raise ResultsError(
             f"no {trial.family} with {LEAST_FREE} free contacts was drawn: give more --contacts"
         )
+
+    @cached_property
+    def _subjects(self) -> list[Subject]:
+        assert self.silhouettes is not None
+        return read_silhouettes(self.silhouettes)
 
     @cached_property
     def _learned(self) -> Imaginer:

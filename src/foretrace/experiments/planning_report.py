@@ -80,8 +80,25 @@ def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
                 "seconds, median": float(np.round(np.median(seconds), 4)),
                 "seconds, p95": float(np.round(np.percentile(seconds, 95), 4)),
             }
-        summary[world] = {"objects": count, "methods": found}
+        families = np.asarray(table["cost"].index.get_level_values("family"))
+        summary[world] = {
+            "objects": count,
+            "methods": found,
+            "families": {
+                str(family): {
+                    method: round(_closed_in(table["cost"].loc[families == family], method), 4)
+                    for method in methods
+                }
+                for family in dict.fromkeys(families.tolist())
+            },
+        }
     return summary
+
+
+def _closed_in(costs: pd.DataFrame, method: str) -> float:
+    """Share of the gap that is closed on some objects, in the mean over goals."""
+    rows = np.arange(len(costs))[None]
+    return float(np.mean([_closed(costs, goal, method, rows) for goal in GOALS]))
 
 
 def _closed(costs: pd.DataFrame, goal: str, method: str, drawn: np.ndarray) -> np.ndarray:
@@ -136,6 +153,14 @@ def report_of(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
             markdown_table(head, lines),
             "Share of the gap closed, by goal:",
             markdown_table(["", *GOALS], by_goal),
+            "Share of the gap closed, by family of objects:",
+            markdown_table(
+                ["", *found["families"]],
+                [
+                    [WORDS[method], *(f"{100 * each[method]:.1f} %" for each in found["families"].values())]
+                    for method in found["methods"]
+                ],
+            ),
         ]
     return "\n\n".join(parts) + "\n"
 
