@@ -92,7 +92,8 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
                                  "recipe": QUICK["one-shot"],
                                  "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
     "identification": lambda root: {"objects": 1, "lever_ups": 1},
-    "monitoring": lambda root: {"executions": 2, "faults": 1, "parts": ("calibration", "normal", "slip", "freeze")},
+    "monitoring": lambda root: {"executions": 2, "faults": 1, "successes": 2,
+                                "parts": ("calibration", "normal", "slip", "freeze")},
     "shipped": lambda root: {"objects": 2, "twin": True},
     "pushes": lambda root: dict(zip(("pushes", "shapes"), factories.write_push_table(root, 90), strict=True))
                            | {"methods": ("nearest", "simulation", "learned")},

@@ -37,6 +37,7 @@ from foretrace.experiments.monitoring_tables import (
     pick,
     scores_of,
 )
+from foretrace.experiments.window_density import successes, unlikeness
 from foretrace.files import short_hash
 from foretrace.imagined import ImaginedEffect, conformal_scores
 from foretrace.monitoring import Monitor, MonitorCalibration, Verdict
@@ -61,6 +62,7 @@ METHODS = {
     "quantile of each sample": GREEN,
     "regions": "#cc79a7",
     "final height": "#8b93a1",
+    "density of windows": "#5b3a8e",
 }
 """What is compared, with its colour."""
 NONE = -1.0
@@ -89,6 +91,8 @@ class Monitoring(Experiment):
     """Which parts; by default all."""
     false_alarms: float = 0.05
     """Share of normal executions that may alarm."""
+    successes: int = 200
+    """Normal executions that the density of windows is learned from."""
 
     label = "monitoring"
     summary = SUMMARIES["monitoring"]
@@ -96,9 +100,10 @@ class Monitoring(Experiment):
 
     def trials(self) -> Sequence[MonitoringTrial]:
         """Normal executions first."""
-        if self.executions < 1 or self.faults < 1:
+        if min(self.executions, self.faults, self.successes) < 1:
             raise ResultsError(
-                f"executions is {self.executions}, faults is {self.faults}: give at least 1 of each"
+                f"executions is {self.executions}, faults is {self.faults}, successes is {self.successes}: give at "
+                "least 1 of each"
             )
         known = (CALIBRATION, NORMAL, *FAULTS)
         if unknown := [part for part in self.parts if part not in known]:
@@ -113,7 +118,8 @@ class Monitoring(Experiment):
         """The predictor, the monitor's calibration, and the seeds."""
         config = (default_checkpoint() / "config.json").read_bytes()
         made = {"predictor": short_hash([config]), "calibration": short_hash([SHIPPED.read_bytes()])}
-        return {**made, "seeds": SEEDS, "false_alarms": self.false_alarms}
+        own = {"false_alarms": self.false_alarms, "successes": self.successes}
+        return {**made, "seeds": SEEDS, **own}
 
     def run(self, trial: MonitoringTrial, folder: Path) -> Sequence[Row]:
         """Scores, alarms, causes and errors of executions."""
@@ -121,7 +127,11 @@ class Monitoring(Experiment):
         total = self.faults if fault else self.executions
         numbers = range(CHUNK * trial.chunk, min(CHUNK * (trial.chunk + 1), total))
         seed = SEEDS.get(trial.part, SEEDS[NORMAL])
-        return [watch(make_execution(seed, k, fault), k, self.false_alarms) for k in numbers]
+        known = successes(self.successes, SEED + 3)
+        return [
+            watch(made, k, self.false_alarms) | {"windows": CM * unlikeness(made.tracked, known)}
+            for k, made in ((k, make_execution(seed, k, fault)) for k in numbers)
+        ]
 
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
         """False alarms, AUROC, detections, delays, causes and rests."""
@@ -231,7 +241,7 @@ class Monitoring(Experiment):
         for k, (method, color) in enumerate(METHODS.items()):
             areas = [summary["methods"][method]["auroc_of"].get(name, np.nan) for name in names]
             ax.plot(
-                np.arange(len(names)) + 0.1 * (k - 2.5), areas, "o", color=color, label=method, markersize=5
+                np.arange(len(names)) + 0.1 * (k - 3), areas, "o", color=color, label=method, markersize=5
             )
         ax.axhline(0.5, color="#8b93a1", linewidth=0.8)
         ax.set_xticks(range(len(names)), [name.replace(" ", "\n") for name in names])

@@ -55,6 +55,7 @@ def scores_of(table: Table) -> dict[str, tuple[np.ndarray, float]]:
         "quantile of each sample": ((probes / limits).max(axis=1), 1.0),
         "regions": (table["regions"], 1.0),
         "final height": (height, calibrated(height)),
+        "density of windows": (table["windows"], calibrated(table["windows"])),
     }
 
 
