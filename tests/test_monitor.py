@@ -18,7 +18,7 @@ from foretrace.monitoring import Drift, MonitorCalibration, Verdict
 from foretrace.monitoring.causes import BAD_INPUT, FROZEN, LOST, CauseModel
 from foretrace.monitoring.motions import motions_of, place_of
 from foretrace.pictures.scene import Scene
-from foretrace.pictures.watched import monitor_film
+from foretrace.pictures.watched import MOST, _evenly, monitor_film
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
@@ -423,6 +423,17 @@ def test_a_film_says_so_from_the_alarm_on(tmp_path):
     assert (given[0] == given[first - 1]).all()
     assert (given[first] == given[-1]).all()
     assert (given[first] != given[first - 1]).any()
+
+
+def test_a_film_runs_in_real_time_however_often_the_object_was_tracked():
+    scene = Scene.imagined(PRISM, ACTION, np.sort(np.append(np.arange(0.0, 2.0, 0.004), 1.0011)), {})
+    even = _evenly(replace(scene, com=np.column_stack([scene.times] * 3)))
+    np.testing.assert_allclose(np.diff(even.times), 0.05)
+    assert even.com is not None
+    assert len(even.pose) == len(even.com) == len(even.times)
+    np.testing.assert_allclose(even.com[:, 0], even.times, atol=0.004)
+    assert even.times[-1] == pytest.approx(scene.times[-1], abs=0.03)
+    assert len(_evenly(replace(scene, times=100 * scene.times)).times) == MOST
 
 
 # --- drift --------------------------------------------------------------------------------------------------------

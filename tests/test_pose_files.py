@@ -26,8 +26,10 @@ PRISM = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.0
         "\r\n".join(["t,X,y,z,qw,qx,qy,qz", *ROWS, ""]),
         "\n".join(row.replace(",", ";").replace(".", ",") for row in (HEAD, *ROWS)),
         "\n".join(f"{row},{k}" for k, row in enumerate([HEAD, *ROWS])),
+        "\n".join([HEAD, ROWS[0], ROWS[0], "0.6,None,null,N/A,nan,,NA,0", ROWS[2]]),
+        "\n".join([HEAD, ROWS[0], "0.6,0,0,0,0,0,0,0", ROWS[2]]),
     ],
-    ids=["as it is", "other names", "decimal commas", "one more column"],
+    ids=["as it is", "other names", "decimal commas", "one more column", "words, a row twice", "zeros"],
 )
 def test_tables_are_read_and_empty_cells_are_lost_poses(tmp_path: Path, text: str):
     file = tmp_path / "poses.csv"
@@ -45,7 +47,16 @@ def test_tables_are_read_and_empty_cells_are_lost_poses(tmp_path: Path, text: st
         ([HEAD], "has no pose"),
         ([""], "has no column"),
         ([HEAD, ROWS[2], ROWS[0]], "time 0.5 s follows 0.7 s"),
-        ([HEAD, ROWS[0].replace("0.1", "here")], "line 2: 'here' is no number"),
+        (
+            [HEAD, "1700000000.25,0,0,0,1,0,0,0", "1700000000.2,0,0,0,1,0,0,0"],
+            "1700000000.2 s follows 1700000000.25 s",
+        ),
+        ([HEAD, ROWS[0], ROWS[0].replace("0.1", "0.2")], "two poses at 0.5 s: leave one out"),
+        ([HEAD + ",x", ROWS[0] + ",0.1"], "has two columns x_m: leave one"),
+        (
+            [HEAD, ROWS[0].replace("0.1", "here")],
+            "line 2: 'here' is no number: give one, or leave the cell empty",
+        ),
         ([HEAD, ROWS[0].replace("0.1", "inf")], "line 2: inf is not finite"),
         ([HEAD, ROWS[0].replace("0.5", "")], "a line has no time"),
     ],
@@ -55,6 +66,11 @@ def test_tables_that_cannot_be_used_are_refused(tmp_path: Path, lines: list[str]
     file.write_text("\n".join(lines))
     with pytest.raises(PerceptionError, match=message):
         read_poses(file)
+
+
+def test_a_table_has_no_topic(tmp_path: Path):
+    with pytest.raises(PerceptionError, match="is a table, which has no topic '/p'"):
+        read_poses(tmp_path / "poses.csv", "/p")
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -69,7 +85,7 @@ def test_transforms_in_bags_are_the_poses_that_were_exported(tmp_path: Path, ver
     np.testing.assert_allclose(pose_to_matrix(poses), pose_to_matrix(effect.pose_trajectory), atol=1e-9)
     with pytest.raises(PerceptionError, match="has no frame 'hand': name one of object, tool"):
         read_poses(bag, child="hand")
-    with pytest.raises(PerceptionError, match="no topic with poses /here"):
+    with pytest.raises(PerceptionError, match="no pose topic /here"):
         read_poses(bag, "/here")
 
 
@@ -114,9 +130,16 @@ def test_a_plan_is_watched_with_poses_in_either_frame(tmp_path: Path, capsys, mo
         said.append(capsys.readouterr().out)
     assert said[0] == said[1]
     assert said[0].startswith("no alarm")
+    table = np.column_stack([effect.times, effect.pose_trajectory])
+    for name, by in (("ms", [1e3] + [1] * 7), ("off", [1] * 4 + [2] * 4)):
+        np.savetxt(f"{name}.csv", table * by, delimiter=",", header=HEAD, comments="")
     for words, wrong in (
-        (["--poses", "table.csv"], "give poses in the action frame"),
-        (["--poses", "own.csv", "--start", "300"], "--start 300 is after the last pose"),
+        (["--poses", "table.csv"], "give poses in the action frame, or, for poses in the table frame"),
+        (["--poses", "own.csv", "--table"], "give poses in the table frame"),
+        (["--poses", "own.csv", "--start", "300"], "--start 300 is after the last pose, at 10"),
+        (["--poses", "own.csv", "--start=-inf"], "--start is -inf: give a time"),
+        (["--poses", "ms.csv"], "ms.csv has 1 pose within the"),
+        (["--poses", "off.csv"], "off.csv, first pose: the quaternion (w, x, y, z) has length 2, not 1"),
         (["--poses", "none.csv"], "none.csv"),
         ([], "is a plan: give --poses FILE"),
         (["3", "--poses", "own.csv"], "is a plan: give --poses FILE, and no number"),

@@ -8,11 +8,12 @@ from jaxtyping import Float
 from tyro.conf import OmitArgPrefixes, Positional
 
 from foretrace.errors import DatasetError, MonitoringError
-from foretrace.files import atomic_path
+from foretrace.files import atomic_path, make_folder
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.imagined import Belief, ImaginedEffect
 from foretrace.interactions.dataset import Dataset
 from foretrace.monitoring import Monitor, Verdict
+from foretrace.monitoring.causes import BAD_INPUT
 from foretrace.pictures.scene import Scene
 from foretrace.pictures.watched import monitor_figure, monitor_film
 from foretrace.planning import Plan
@@ -93,12 +94,12 @@ def monitor(
                 "plan.json"
             )
         watched = _watch_interaction(data, id, run, belief, false_alarms, calibration)
-    with atomic_path(out) as temporary:
-        if out.suffix.lower() in FILMS:
-            film = temporary.with_name(f"{temporary.name}{out.suffix}")
-            monitor_film(watched.scene, watched.imagined, watched.verdicts, film).replace(temporary)
-        else:
-            figure = monitor_figure(watched.imagined, watched.verdicts, watched.com, watched.scene.title)
+    make_folder(out.parent, MonitoringError)
+    if out.suffix.lower() in FILMS:
+        monitor_film(watched.scene, watched.imagined, watched.verdicts, out)
+    else:
+        figure = monitor_figure(watched.imagined, watched.verdicts, watched.com, watched.scene.title)
+        with atomic_path(out) as temporary:
             figure.savefig(temporary, format=out.suffix[1:].lower())
     alarm, last = next((each for each in watched.verdicts if each.alarm), None), watched.verdicts[-1]
     if alarm is None:
@@ -136,8 +137,6 @@ def _watch_plan(
     false_alarms: float,
     calibration: Path | None,
 ) -> _Watched:
-    from foretrace.perception.pose_files import read_poses
-
     assert track.poses is not None
     plan = Plan.open(file)
     T_table_action = plan.T_table_action if track.table else None
@@ -146,24 +145,16 @@ def _watch_plan(
             f"{file} does not say where the object lies on the table: plan with --pose or --photo, or give poses in "
             "the action frame"
         )
-    times, poses = read_poses(track.poses, track.topic, track.child)
-    times = times - (times[0] if track.start is None else track.start)
-    if not (kept := times >= -1e-9).any():
-        raise MonitoringError(
-            f"--start {track.start:g} is after the last pose: give a time by the clock of the poses"
-        )
-    times, poses = times[kept], poses[kept]
+    times, poses = _poses_since_start(track, plan.action.duration)
     lost = np.isnan(poses[:, 0])
-    if lost.all():
-        raise MonitoringError(
-            f"{track.poses} has no pose after the beginning of the action: record it while it runs"
-        )
     plan = plan.imagined_by(load_imaginer(run), belief)
     watching = Monitor(plan, false_alarms, T_table_action=T_table_action, calibration=calibration)
     verdicts = [
         watching.update(float(t), None if gone else pose)
         for t, pose, gone in zip(times, poses, lost, strict=True)
     ]
+    if (first := verdicts[int(np.argmin(lost))]).cause == BAD_INPUT:
+        raise MonitoringError(f"{track.poses}, first pose: {first.message}")
     # Whichever frame of the object is tracked: it has moved from where the plan saw the object at rest.
     seen = pose_to_matrix(poses[np.maximum.accumulate(np.where(lost, np.argmin(lost), np.arange(len(lost))))])
     if T_table_action is not None:
@@ -179,3 +170,34 @@ def _watch_plan(
     scene = Scene.imagined(obj, plan.action, times, {}, matrix_to_pose(moved @ rest))
     scene = replace(scene, com=com, title=f"{plan.goal}: {track.poses.name}")
     return _Watched(scene, plan.imagined, verdicts, np.where(lost[:, None], np.nan, com))
+
+
+def _poses_since_start(
+    track: TrackOptions, duration: float
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 7"]]:
+    """Times since the beginning of an action [s], and poses from then on, NaN where the object was lost.
+
+    Raises:
+        PerceptionError: The file cannot be read.
+        MonitoringError: There are not two poses while the action lasts.
+    """
+    from foretrace.perception.pose_files import read_poses
+
+    assert track.poses is not None
+    if track.start is not None and not np.isfinite(track.start):
+        raise MonitoringError(f"--start is {track.start}: give a time by the clock of the poses, in seconds")
+    times, poses = read_poses(track.poses, track.topic, track.child)
+    start, last = (times[0] if track.start is None else track.start), times[-1]
+    if start > last:
+        raise MonitoringError(
+            f"--start {start:.15g} is after the last pose, at {last:.15g}: give a time by the clock of the poses"
+        )
+    kept = times - start >= -1e-9
+    times, poses = times[kept] - start, poses[kept]
+    if (count := int((np.isfinite(poses[:, 0]) & (times <= duration)).sum())) < 2:
+        poses_are = f"{count} pose{'' if count == 1 else 's'}"
+        raise MonitoringError(
+            f"{track.poses} has {poses_are} within the {duration:.1f} s that the action takes from {start:.15g} on: "
+            "give times in seconds, and poses while it runs"
+        )
+    return times, poses

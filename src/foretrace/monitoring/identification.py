@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import logsumexp
 
 from foretrace.actions import Action
-from foretrace.errors import MonitoringError, check_type
+from foretrace.errors import MonitoringError, check_type, fault, is_whole, shown
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import IMAGINERS, Imaginer, ObservedMotion, estimate_com
 from foretrace.imagined.belief import COM, EXECUTION, Belief
@@ -78,7 +78,7 @@ def identify(
         What is believed after it. ``learned`` names what was learned; all else keeps its prior.
 
     Raises:
-        MonitoringError: An argument is of another type, or the imaginer imagines no rotations.
+        MonitoringError: An argument is of another type, the seed is none, or the imaginer imagines no rotations.
         PredictionError: The view or the motion cannot be used.
     """
     check_type("view", view, TopDownView, MonitoringError)
@@ -86,6 +86,7 @@ def identify(
     check_type("prior", prior, (Belief, type(None)), MonitoringError, "a Belief, such as an earlier result")
     for name, each in (("imaginer", imaginer), ("exact", exact)):
         check_type(name, each, (Imaginer, type(None)), MonitoringError)
+    check_seed(seed)
     motion = observed_motion(effect)
     imaginer = imaginer or IMAGINERS.find("learned")(None)
     imaginer.imagine(view, action)  # with its checks of the view
@@ -113,6 +114,18 @@ def identify(
         again = play_worlds(exact, view, action, com, worlds, parameters)
         weights = _tempered(log_likelihood(again, motion, WIDTH / 2) - likelihood[few])
     return belief.updated(values, weights)
+
+
+def check_seed(seed: int) -> None:
+    """Refuse what is no seed.
+
+    Raises:
+        MonitoringError: It is no whole number from 0 on.
+    """
+    if not is_whole(seed, 0, 2**63 - 1):
+        raise fault(MonitoringError, isinstance(seed, int))(
+            f"seed is {shown(seed)}: give a whole number from 0 to {2**63 - 1}"
+        )
 
 
 def log_likelihood(

@@ -16,7 +16,7 @@ from foretrace.imagined.futures import ImaginedBatch
 from foretrace.imagined.worlds import play_worlds
 from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.topdown import TopDownView
-from foretrace.monitoring.identification import RATE, SPEED_TIME, WIDTH, log_likelihoods
+from foretrace.monitoring.identification import RATE, SPEED_TIME, WIDTH, check_seed, log_likelihoods
 from foretrace.monitoring.motions import WEIGHTS
 
 OBJECTS = 32
@@ -52,13 +52,14 @@ def information_gain(
         seed: Decides the draws, which are the same for all actions.
 
     Raises:
-        MonitoringError: An argument is of another type, or the imaginer imagines no rotations.
+        MonitoringError: An argument is of another type, the seed is none, or the imaginer imagines no rotations.
         PredictionError: The view does not show one object that such an action reaches.
     """
     check_type("view", view, TopDownView, MonitoringError)
     check_type("actions", actions, Iterable, MonitoringError, "a list of actions")
     check_type("belief", belief, Belief, MonitoringError, "a Belief, such as one of foretrace.identify")
     check_type("imaginer", imaginer, (Imaginer, type(None)), MonitoringError)
+    check_seed(seed)
     imaginer = imaginer or IMAGINERS.find("learned")(None)
     actions = tuple(actions)
     imaginer.imagine_candidates(view, actions, com=com)  # with its checks

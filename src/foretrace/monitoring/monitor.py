@@ -239,9 +239,11 @@ class Monitor:
         if self._told_rest is None:
             off = pose[:3] - self.imagined.com_trajectory[0]
             if (far := float(np.linalg.norm(off))) > FAR:
+                others = ", or, for poses in the table frame, T_table_action (--table)"
+                right = f"action frame{others}" if self._T_action_table is None else "table frame"
                 raise MonitoringError(
                     f"the first pose lies {100 * far:.1f} cm from the centre of mass of the object that was seen: give "
-                    "poses in the action frame, or T_table_action"
+                    f"poses in the {right}"
                 )
             if t > self._quiet_until + 1e-9:
                 raise MonitoringError(

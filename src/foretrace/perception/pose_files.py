@@ -19,6 +19,8 @@ ALIASES = {"t": "time_s", "time": "time_s", "x": "x_m", "y": "y_m", "z": "z_m"}
 """Other names of columns."""
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+LOST = ("", "none", "null", "na", "n/a")
+"""What stands in a table where the object was lost, beside words for what is no number ("nan")."""
 REMEDY = f"give a table with the columns {', '.join(COLUMNS)}"
 
 
@@ -27,6 +29,9 @@ def read_poses(
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 7"]]:
     """Times [s] and poses (position [m], quaternion w, x, y, z) of an object, in the tracker's frame and clock.
 
+    A quaternion of zeros, as some trackers write it, also means that the object was lost. A sample that is repeated as
+    it is counts once.
+
     Args:
         path: A table (CSV with a head, in which empty cells mean that the object was lost: NaN here), or a bag of ROS 1
             or ROS 2 with stamped poses or transforms.
@@ -34,16 +39,26 @@ def read_poses(
         child: Of transforms, the frame whose motion is read.
 
     Raises:
-        PerceptionError: The file cannot be read, or has no poses, or times that go back.
+        PerceptionError: The file cannot be read, or has no poses, or times that do not rise; a topic of a table.
     """
     bag = path.is_dir() or path.suffix.lower() in BAGS
+    if topic is not None and not bag:
+        raise PerceptionError(
+            f"{path} is a table, which has no topic {shown(topic)}: leave it out, or give a bag"
+        )
     times, poses = _from_bag(path, topic, child) if bag else _from_table(path)
     if len(times) == 0:
         raise PerceptionError(f"{path} has no pose: {REMEDY}, or a bag with poses")
+    poses[(poses[:, 3:] == 0).all(axis=1)] = np.nan
+    same = (poses[1:] == poses[:-1]) | (np.isnan(poses[1:]) & np.isnan(poses[:-1]))
+    once = np.concatenate([[True], (np.diff(times) != 0) | ~same.all(axis=1)])
+    times, poses = times[once], poses[once]
     if (back := np.flatnonzero(np.diff(times) <= 0)).size:
-        k = int(back[0])
+        before, after = (f"{times[int(back[0]) + k]:.15g} s" for k in (0, 1))
         raise PerceptionError(
-            f"{path}: time {times[k + 1]:g} s follows {times[k]:g} s: put the poses into the order of their times"
+            f"{path}: two poses at {before}: leave one out"
+            if before == after
+            else f"{path}: time {after} follows {before}: put the poses into the order of their times"
         )
     return times, poses
 
@@ -57,6 +72,8 @@ def _from_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     names = [ALIASES.get(name, name) for name in names]
     if missing := [name for name in COLUMNS if name not in names]:
         raise PerceptionError(f"{path} has no column {', '.join(missing)}: {REMEDY}")
+    if twice := [name for name in COLUMNS if names.count(name) > 1]:
+        raise PerceptionError(f"{path} has two columns {', '.join(twice)}: leave one of each out")
     columns = [names.index(name) for name in COLUMNS]
     rows = [
         [_number(path, number, line, column) for column in columns]
@@ -74,12 +91,15 @@ def _from_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _number(path: Path, number: int, line: list[str], column: int) -> float:
     cell = line[column].strip() if column < len(line) else ""
-    if not cell:
+    if cell.lower() in LOST:
         return np.nan
     try:
         value = float(cell.replace(",", "."))
     except ValueError:
-        raise PerceptionError(f"{path}, line {number}: {shown(cell)} is no number: {REMEDY}") from None
+        raise PerceptionError(
+            f"{path}, line {number}: {shown(cell)} is no number: give one, or leave the cell empty where the object "
+            "was lost"
+        ) from None
     if np.isinf(value):
         raise PerceptionError(f"{path}, line {number}: {cell} is not finite: leave the cell empty")
     return value
@@ -94,7 +114,11 @@ def _from_bag(path: Path, topic: str | None, child: str) -> tuple[np.ndarray, np
             for name, kind in kinds.items()
             if kind in POSES or (kind == TRANSFORMS and name != "/tf_static")
         )
-        chosen = choose_topic(path, topic, usable, "topic with poses", "--topic")
+        if not usable:
+            raise PerceptionError(
+                f"bag {path} has no topic with poses: record PoseStamped, PoseWithCovarianceStamped or transforms (/tf)"
+            )
+        chosen = choose_topic(path, topic, usable, "pose topic", "--topic")
         for _, recorded, message in read_messages(reader, path, [chosen]):
             for stamped, pose in _stamped(message, kinds[chosen], child, frames):
                 stamp = stamped.header.stamp

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from foretrace.errors import PredictionError
+from foretrace.files import atomic_path
 from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject
@@ -94,7 +95,8 @@ def write_animation(path: Path, pictures: Iterator[np.ndarray], period: float) -
     if path.suffix.lower() not in writers:
         raise PredictionError(f"cannot write an animation to {path}: choose a name ending in .gif or .mp4")
     path.parent.mkdir(parents=True, exist_ok=True)
-    writers[path.suffix.lower()](path, pictures, period)
+    with atomic_path(path) as draft:
+        writers[path.suffix.lower()](draft, pictures, period)
     return path
 
 
@@ -379,7 +381,8 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], period: float) -> Non
     palette.putpalette(found.ravel().tolist())
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [round(1000 * period)] * (len(images) - 1) + [round(1000 * LAST_FRAME_TIME)]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)
+    first, *others = images
+    first.save(path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
 
 
 def _write_mp4(path: Path, pictures: Iterator[np.ndarray], period: float) -> None:
@@ -387,12 +390,16 @@ def _write_mp4(path: Path, pictures: Iterator[np.ndarray], period: float) -> Non
         import imageio_ffmpeg
     except ImportError as error:
         raise PredictionError(
-            f"cannot write {path}: MP4 needs `pip install foretrace[video]`; or choose a .gif"
+            "cannot write MP4: it needs `pip install foretrace[video]`; or choose a .gif"
         ) from error
     shown = list(pictures)
     height, width, _ = shown[0].shape
-    rate: Any = 1 / period
-    writer: Any = imageio_ffmpeg.write_frames(str(path), (width, height), fps=rate, macro_block_size=2)
+    options: Any = {
+        "fps": 1 / period,
+        "macro_block_size": 2,
+        "output_params": ["-f", "mp4"],
+    }  # whatever the name
+    writer: Any = imageio_ffmpeg.write_frames(str(path), (width, height), **options)
     writer.send(None)
     for picture in [*shown, *[shown[-1]] * round(LAST_FRAME_TIME / period)]:
         writer.send(np.ascontiguousarray(picture))

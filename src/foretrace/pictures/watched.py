@@ -27,6 +27,10 @@ from foretrace.pictures.style import (
 
 SHOWN = 60
 """Motions of worlds that are drawn."""
+PERIOD = 0.05
+"""Least time between the pictures of a film [s]."""
+MOST = 300
+"""Pictures of a film, at most."""
 
 
 @styled
@@ -64,6 +68,8 @@ def monitor_film(
 ) -> Path:
     """Write the execution as a GIF or MP4 in real time: the object, where it was expected, and score over time.
 
+    Pictures follow each other evenly, at most 20 in a second and `MOST` in all, however often the object was tracked.
+
     Args:
         scene: The execution; its samples are those of the verdicts.
         imagined: What was imagined.
@@ -73,6 +79,9 @@ def monitor_film(
     Raises:
         PredictionError: The ending is unknown, or MP4 cannot be written here.
     """
+    com = scene.com
+    assert com is not None
+    scene = _evenly(scene)
     expected = imagined.object_poses(scene.placement)
     ghosts = (
         ()
@@ -80,8 +89,6 @@ def monitor_film(
         else (Ghost(_at(scene.times, imagined.times, expected), PREDICTION_COLORS[0], 1.0),)
     )
     scene = replace(scene, predictions={"imagined": imagined.com_trajectory}, ghosts=ghosts)
-    com = scene.com
-    assert com is not None
 
     def diagrams(axes: list[Axes], _: Scene) -> None:
         _draw_verdicts(axes, imagined, verdicts, com)
@@ -93,9 +100,25 @@ def monitor_film(
             ax.set_ylabel(ax.get_ylabel(), fontsize=7.5)
 
     alarm = _alarm(verdicts)
-    news = None if alarm is None else (verdicts.index(alarm), _words(alarm).capitalize())
-    period = float(np.median(np.diff(scene.times))) if len(scene.times) > 1 else 0.05
+    news = None
+    if alarm is not None:
+        since = int(np.searchsorted(scene.times, alarm.time - 1e-6))
+        news = min(since, len(scene.times) - 1), _words(alarm).capitalize()
+    period = float(scene.times[1] - scene.times[0]) if len(scene.times) > 1 else PERIOD
     return write_animation(Path(path), frames(scene, height=500, diagrams=diagrams, news=news), period)
+
+
+def _evenly(scene: Scene) -> Scene:
+    """A scene at even times: at each, the last sample so far."""
+    times = scene.times
+    if len(times) < 2:
+        return scene
+    span = float(times[-1] - times[0])
+    period = max(PERIOD, float(np.median(np.diff(times))), span / (MOST - 1))
+    even = times[0] + period * np.arange(round(span / period) + 1)
+    rows = np.searchsorted(times, even + 1e-6, side="right") - 1
+    own = {name: getattr(scene, name)[rows] for name in ("com", "tool") if getattr(scene, name) is not None}
+    return replace(scene, times=even, pose=scene.pose[rows], **own)
 
 
 def _alarm(verdicts: Sequence[Verdict]) -> Verdict | None:
