@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
+import type_checks
+
 if TYPE_CHECKING:
     from foretrace.simulation.recording import RecordingTruth
 
@@ -20,6 +22,8 @@ settings.register_profile(
     derandomize=bool(os.environ.get("CI")),
 )
 settings.load_profile("foretrace")
+
+type_checks.install()
 
 
 @pytest.fixture(autouse=True, scope="session")
