@@ -1,35 +1,32 @@
 """What may happen to a polygon, from any exported predictor, without loading its checkpoint.
 
-python examples/run_onnx.py [model.onnx]; by default the predictor that comes with the package is exported first.
+python examples/run_onnx.py [model.onnx]; by default the file of the predictor that comes with the package.
 """
 
 import json
 import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import onnxruntime
 
 import foretrace as ft
-from foretrace.export.onnx import export_onnx
 from foretrace.features import FEATURES, make_features
 from foretrace.imagined.context import nominal_constants, nominal_parameters
 from foretrace.interactions.dataset import InteractionBatch
+from foretrace.predictor.loading import default_checkpoint
 
 prism = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)], height=0.02)
 action = ft.LeverUp.at_edge(prism, edge=2)
 view = ft.TopDownView.of(prism, action)  # or TopDownView.from_mask, from_points
 
-with TemporaryDirectory() as folder:
-    own = export_onnx(ft.load_predictor(), Path(folder, "model.onnx")).path if len(sys.argv) == 1 else None
-    file = own or Path(sys.argv[1])
-    try:
-        session = onnxruntime.InferenceSession(file)
-        about = session.get_modelmeta().custom_metadata_map
-        config, context = (json.loads(about[f"foretrace.{name}"]) for name in ("config", "context"))
-    except Exception:  # onnxruntime's have no class in common
-        sys.exit(f"{file} is missing or no predictor: give a file that `foretrace export onnx` wrote")
+file = Path(sys.argv[1]) if len(sys.argv) > 1 else default_checkpoint() / "model.onnx"
+try:
+    session = onnxruntime.InferenceSession(file)
+    about = session.get_modelmeta().custom_metadata_map
+    config, context = (json.loads(about[f"foretrace.{name}"]) for name in ("config", "context"))
+except Exception:  # onnxruntime's have no class in common
+    sys.exit(f"{file} is missing or no predictor: give a file that `foretrace export onnx` wrote")
 x, y = view.to_metres(np.argwhere(view.mask).mean(axis=0)[None])[0]
 usual = dict(nominal_constants()) | dict(nominal_parameters())
 inputs = {

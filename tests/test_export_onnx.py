@@ -1,9 +1,10 @@
 import io
 import json
 import re
-import subprocess
+import runpy
 import sys
 from contextlib import redirect_stdout
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,15 @@ from foretrace.features import ImageCnn
 from foretrace.features.windows import convolve_unbranched, convolve_windows
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined import STARTS, estimate_com
-from foretrace.predictor import LstmConfig, LstmPredictor, OneShotConfig, OneShotPredictor, save_checkpoint
+from foretrace.predictor import (
+    LstmConfig,
+    LstmPredictor,
+    OneShotConfig,
+    OneShotPredictor,
+    load_predictor,
+    save_checkpoint,
+)
+from foretrace.predictor.loading import PORTABLE, default_checkpoint
 from foretrace.predictor.states import state_size
 from test_examples import EXAMPLES, run_python
 
@@ -58,8 +67,8 @@ def shake(predictor, seed: int = 0):
 def one_shot() -> OneShotPredictor:
     torch.manual_seed(0)
     config = OneShotConfig(
-        feature_options={"heights": True}, hidden=8, layers=2, ensemble=2, components=4,
-        outcomes=("levered", "slipped"),
+        feature_options={"heights": True}, context=("friction", "density"), hidden_share=0.5, hidden=8, layers=2,
+        ensemble=2, components=4, outcomes=("levered", "slipped"),
     )  # fmt: skip
     return shake(OneShotPredictor(config, SAMPLES))
 
@@ -85,6 +94,19 @@ def command(tmp_path_factory):
     return predictor, file, printed.getvalue()
 
 
+@pytest.fixture
+def run_example(monkeypatch, capsys):
+    """What the example prints of a file."""
+
+    def run(*file: Path) -> str:
+        monkeypatch.setattr(sys, "argv", ["run_onnx.py", *map(str, file)])
+        capsys.readouterr()
+        runpy.run_path(str(EXAMPLES / "run_onnx.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
 @pytest.fixture(scope="module")
 def views():
     return fake_batch(np.random.default_rng(0), 6, num_samples=SAMPLES)
@@ -96,9 +118,10 @@ def test_a_distribution_is_that_of_the_predictor(command, views):
     names = [output.name for output in session.get_outputs()]
     for rows in (slice(0, 1), slice(1, 4), slice(0, 6)):
         features, com = predictor.features.inputs(views[rows]), estimate_com(views[rows])
-        inputs = {"features": features.numpy(), "com": com.astype(np.float32)}
+        context = np.full((len(com), 2), [0.5, np.nan], np.float32)  # the density is not told
+        inputs = {"features": features.numpy(), "com": com.astype(np.float32), "context": context}
         said = dict(zip(names, session.run(None, inputs), strict=True))
-        futures = predictor.imagine_effects(features, com).futures
+        futures = predictor.imagine_effects(predictor.add_context(features, context), com).futures
         np.testing.assert_allclose(said["probability"], futures.probability, atol=1e-6)
         np.testing.assert_allclose(said["com_trajectory"], futures.com, atol=1e-6)
         np.testing.assert_allclose(said["spread"], futures.spread, rtol=1e-4)
@@ -140,8 +163,9 @@ def test_a_file_tells_what_it_is(command):
     assert "Cholesky" not in "".join(node.op_type for node in model.graph.node)
 
 
-def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
+def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path, monkeypatch, run_example):
     predictor = image_cnn()
+    monkeypatch.setattr(exporting, "BATCHES", (1, 5))
     written = exporting.export_onnx(predictor, tmp_path / "model.onnx")
     assert list(written.inputs) == ["mask", "com", "context"]
     assert list(written.outputs) == ["com_trajectory", "rotation_matrix"]
@@ -159,11 +183,11 @@ def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path):
     np.testing.assert_allclose(path, imagined.com, atol=1e-5)
     np.testing.assert_allclose(rotation, quaternion_to_matrix(imagined.pose[..., 3:]), atol=1e-5)
 
-    assert "the centre of mass ends at [" in run_python(EXAMPLES / "run_onnx.py", written.path)
+    assert "the centre of mass ends at [" in run_example(written.path)
 
 
 @pytest.mark.parametrize("content", ["missing", "text", "another model"])
-def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path):
+def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path, run_example):
     file = tmp_path / "model.onnx"
     if content == "text":
         file.write_text("hello")
@@ -173,27 +197,28 @@ def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path)
         graph = onnx.helper.make_graph([same], "same", ports[:1], ports[1:])
         opset = [onnx.helper.make_opsetid("", 18)]
         onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), file)
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "run_onnx.py", file], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 1
     told = "is missing or no predictor: give a file that `foretrace export onnx` wrote"
-    assert done.stderr == f"{file} {told}\n"
+    with pytest.raises(SystemExit) as ended:
+        run_example(file)
+    assert ended.value.code == f"{file} {told}"  # Python writes it to standard error, and ends with 1
 
 
 @pytest.mark.slow
-def test_the_predictor_of_the_package_is_exported_by_the_example():
+def test_the_file_of_the_package_is_that_of_its_predictor(run_example):
     """Its noise is badly conditioned: file and PyTorch both stray from float64."""
-    assert re.search(r"^\d+%: .*\nthe centre of mass ends at \[", run_python(EXAMPLES / "run_onnx.py"))
+    network = network_of(load_predictor())
+    written = exporting.compare(network, default_checkpoint() / PORTABLE, np.random.default_rng(0))
+    assert set(written) == set(network.outputs)
+    assert re.search(r"^\d+%: .*\nthe centre of mass ends at \[", run_example())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("label", ["sc-200", "sp-truth"])
-def test_the_example_runs_with_other_features(label, tmp_path):
-    predictor = LstmPredictor(LstmConfig(features=label, state="position", hidden=4), SAMPLES)
+def test_the_example_runs_with_other_features(label, tmp_path, run_example):
+    predictor = LstmPredictor(LstmConfig(features=label, state="position", hidden=4), 2)
     predictor.eval()
     written = exporting.export_onnx(predictor, tmp_path / "model.onnx")
-    said = run_python(EXAMPLES / "run_onnx.py", written.path)
+    said = run_example(written.path)
     assert ("zeros stand in" in said) == (label == "sp-truth")
     assert "the centre of mass ends at [" in said
 
