@@ -1,6 +1,7 @@
 import contextlib
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,18 +18,28 @@ from foretrace.interactions import storage
 from foretrace.interactions.dataset import Dataset
 
 
+def fake_simulate(trials):
+    return [factories.fake_lever_up(one.obj, one.action, id=one.id, seed=one.seed) for one in trials]
+
+
 @pytest.fixture
 def fake_physics(monkeypatch):
-    def fake_simulate(trials):
-        return [factories.fake_lever_up(one.obj, one.action, id=one.id, seed=one.seed) for one in trials]
-
     monkeypatch.setattr("foretrace.simulation.lever_up.simulate_trials", fake_simulate)
 
 
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory) -> Path:
+    """What `folder` copies."""
+    folder = tmp_path_factory.mktemp("cli") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("foretrace.simulation.lever_up.simulate_trials", fake_simulate)
+        assert cli.main(["simulate", "--out", str(folder), "--objects", "8", "--workers", "1"]) == 0
+    return folder
+
+
 @pytest.fixture
-def folder(fake_physics, tmp_path) -> Path:
-    assert cli.main(["simulate", "--out", str(tmp_path / "data"), "--objects", "8", "--workers", "1"]) == 0
-    return tmp_path / "data"
+def folder(fake_physics, simulated, tmp_path) -> Path:
+    return shutil.copytree(simulated, tmp_path / "data")
 
 
 def environment() -> dict[str, str]:
