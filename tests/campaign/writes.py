@@ -37,17 +37,26 @@ LOADED = (
         "foretrace.evaluation.run",
     ),
     *("foretrace.experiments.predictor", "foretrace.export.lerobot", "foretrace.export.rosbag"),
-    *("foretrace.pictures.animation", "foretrace.pictures.scene", "foretrace.simulation.recording"),
+    *(
+        "foretrace.cli.plan_many",
+        "foretrace.cli.planning",
+        "foretrace.export.rerun",
+        "foretrace.pictures.animation",
+    ),
+    *("foretrace.pictures.contact_sheet", "foretrace.pictures.prediction", "foretrace.pictures.scene"),
+    *("foretrace.predictor.display", "foretrace.predictor.runtime", "foretrace.predictor.training"),
+    "foretrace.simulation.recording",
     *(
         "matplotlib.pyplot",
         "pandas",
+        "torch._dynamo",
         "torch.utils.tensorboard",
         "torch.onnx",
         "onnx",
         "onnxscript",
         "onnxruntime",
     ),
-    *("rerun", "rosbags.rosbag1", "rosbags.rosbag2"),
+    *("markdown_it", "rerun", "rich.markdown", "rosbags.rosbag1", "rosbags.rosbag2", "typeguard", "tyro"),
 )
 """Modules that commands load."""
 ANY = "any"
