@@ -253,7 +253,7 @@ def test_the_command_on_the_card_asks_for_the_same_training(card: str, run: Path
 def test_recalibrated_regions_hold_on_the_new_data(card: str, run: Path, tmp_path: Path, capsys) -> None:
     again = tmp_path / "run"
     shutil.copytree(run, again)
-    interactions = factories.fake_interactions(np.random.default_rng(1), 240, num_samples=SAMPLES)
+    interactions = factories.fake_interactions(np.random.default_rng(1), 200, num_samples=SAMPLES)
     other = write_data(tmp_path / "other", interactions)
     assert cli.main(["recalibrate", "--run", str(again), "--data", str(other)]) == 0
     assert "start estimated" in capsys.readouterr().out
@@ -290,10 +290,10 @@ def test_recalibration_refuses(
     kind: str, message: str, run: Path, data: Path, tmp_path: Path, capsys, monkeypatch
 ) -> None:
     rng = np.random.default_rng(2)
-    number, samples = {"few": (40, SAMPLES), "sampled": (240, SAMPLES + 3)}.get(kind, (240, SAMPLES))
-    found = data if kind == "own" else tmp_path / "data"
-    if kind != "own":
-        write_data(found, factories.fake_interactions(rng, number, num_samples=samples))
+    found = tmp_path / "data" if kind in ("few", "sampled", "lstm") else data
+    if found != data:
+        samples = SAMPLES + 3 * (kind == "sampled")
+        write_data(found, factories.fake_interactions(rng, 40, num_samples=samples))
     folder = tmp_path / "run"
     if kind == "lstm":
         config = LstmConfig(features="none", hidden=4)
@@ -302,7 +302,7 @@ def test_recalibration_refuses(
     elif kind != "none":
         shutil.copytree(run, folder)
     before = {file.name: file.read_bytes() for file in folder.glob("*.*")}
-    if kind == "own":
+    if kind != "few":
         monkeypatch.setattr("foretrace.predictor.recalibration.FEWEST", 10)
     assert cli.main(["recalibrate", "--run", str(folder), "--data", str(found)]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
