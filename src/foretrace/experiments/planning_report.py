@@ -47,6 +47,8 @@ WORDS = {
 DRAWS = 2000
 """Bootstrap samples of the objects."""
 LEAST_GAP = 1e-9
+WORST = 20
+"""Plans that are looked at because they lose most."""
 
 
 def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -91,8 +93,24 @@ def summary_of(rows: pd.DataFrame) -> dict[str, Any]:
                 }
                 for family in dict.fromkeys(families.tolist())
             },
+            "worst": _worst_of(mine),
         }
     return summary
+
+
+def _worst_of(rows: pd.DataFrame, method: str = "learned, checked") -> dict[str, Any]:
+    """The plans of a method that lose most to the oracle: their share of the loss, families, and slips."""
+    keys = ["family", "number", "goal"]
+    own, best = (rows.loc[rows["method"].eq(name)].set_index(keys) for name in (method, "oracle"))
+    lost = (own["cost"] - best["cost"].reindex(own.index)).sort_values(ascending=False)
+    worst = own.loc[lost.index[:WORST]]
+    return {
+        "plans": len(own),
+        "worst": len(worst),
+        "share of the loss": round(float(lost.iloc[:WORST].sum() / max(lost.sum(), LEAST_GAP)), 4),
+        "families": {str(name): int(n) for name, n in worst.reset_index()["family"].value_counts().items()},
+        "slipped": int((worst["slipped"] > 0.5).sum()),
+    }
 
 
 def _closed_in(costs: pd.DataFrame, method: str) -> float:
@@ -161,8 +179,18 @@ def report_of(summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
                     for method in found["methods"]
                 ],
             ),
+            _about_worst(found["worst"]),
         ]
     return "\n\n".join(parts) + "\n"
+
+
+def _about_worst(found: Mapping[str, Any]) -> str:
+    families = ", ".join(f"{count} of the family {name}" for name, count in found["families"].items())
+    return (
+        f"Of {found['plans']} plans that the twin checked, the {found['worst']} worst hold "
+        f"{100 * found['share of the loss']:.0f} % of what is lost to the oracle ({families}); in {found['slipped']} "
+        "of them the object slips."
+    )
 
 
 def _percent(numbers: Mapping[str, float]) -> str:
@@ -176,8 +204,9 @@ def draw(rows: pd.DataFrame) -> dict[str, Figure]:
     summary = summary_of(rows)
     if not summary:
         return {}
-    fig = new_figure(9.0, 4.2)
-    axes = np.ravel(fig.subplots(1, len(summary), sharey=True, squeeze=False))
+    counts = [len(found["methods"]) for found in summary.values()]
+    fig = new_figure(0.62 * sum(counts), 4.2)
+    axes = np.ravel(fig.subplots(1, len(summary), sharey=True, squeeze=False, width_ratios=counts))
     for ax, (world, found) in zip(axes, summary.items(), strict=True):
         methods = [name for name in found["methods"] if name not in ("random", "oracle")]
         for k, method in enumerate(methods):
@@ -185,7 +214,7 @@ def draw(rows: pd.DataFrame) -> dict[str, Figure]:
             mean, low, high = (100 * numbers[name] for name in ("mean", "low", "high"))
             ax.bar(k, mean, color=METHODS[method], width=0.7)
             ax.plot([k, k], [low, high], color=INK, linewidth=1.2)
-            number = ax.text(k, max(high, 0) + 2, f"{mean:.0f}", ha="center", fontsize=8.5)
+            number = ax.text(k, max(high, 0) + 2, f"{round(mean)}", ha="center", fontsize=8.5)
             number.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.8})
         ax.axhline(100, color=INK, linewidth=0.8, linestyle=":", zorder=1)
         ax.set_xticks(range(len(methods)), [name.replace(" ", "\n", 1) for name in methods], fontsize=7.5)
