@@ -1,11 +1,13 @@
 """The examples run as they stand, say something sensible, and stay short."""
 
+import io
 import json
 import os
 import re
 import runpy
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,20 +21,11 @@ from export_samples import fake_data
 from foretrace.actions import LeverUp
 from foretrace.errors import SimulationError
 from foretrace.objects import paper_objects
+from foretrace.predictor import LstmConfig, save_checkpoint
 from foretrace.simulation.camera import take_rgbd
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_LINES = 60
-SAVE_UNTRAINED = """
-import sys
-import numpy as np
-from foretrace.predictor import LstmConfig, save_checkpoint
-
-predictor = LstmConfig(features="none").make(num_samples=60)
-predictor.set_normalisation(np.zeros(3), np.ones(3), 0.05 * np.arange(60))
-save_checkpoint(sys.argv[1], predictor)
-"""
-"""A predictor that is made quickly, and wrong. In a process of its own, as everything here: that is faster."""
 
 
 def run_python(*arguments: str | Path) -> str:
@@ -42,6 +35,15 @@ def run_python(*arguments: str | Path) -> str:
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def run_here(example: str, *arguments: str | Path) -> str:
+    """What an example prints that needs PyTorch, which is loaded here already."""
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
+        patch.setattr(sys, "argv", [example, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / example), run_name="__main__")
+    return printed.getvalue()
 
 
 @pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
@@ -72,8 +74,10 @@ def test_own_experiment(tmp_path: Path) -> None:
 
 
 def test_predict_a_polygon_with_a_predictor(tmp_path: Path) -> None:
-    run_python("-c", SAVE_UNTRAINED, tmp_path)
-    printed = run_python(EXAMPLES / "predict_a_polygon.py", tmp_path)
+    predictor = LstmConfig(features="none").make(num_samples=60)
+    predictor.set_normalisation(np.zeros(3), np.ones(3), 0.05 * np.arange(60))
+    save_checkpoint(tmp_path, predictor)  # made quickly, and wrong
+    printed = run_here("predict_a_polygon.py", tmp_path)
     assert "outcome: levered" in printed
     assert 20 < float(re.findall(r"tilt at the end: ([\d.]+)", printed)[0]) < 80
     assert len(re.findall(r"\d s   x", printed)) == 6
@@ -87,9 +91,9 @@ def test_predict_a_polygon_with_a_predictor(tmp_path: Path) -> None:
         ("own_feature.py", r"^extent \+ LSTM: the centre of mass ends at \["),
     ],
 )
-def test_own_predictors_and_features(tmp_path: Path, example: str, printed: str) -> None:
+def test_own_predictors_and_features(tmp_path: Path, example: str, printed: str, registered: None) -> None:
     data = fake_data(tmp_path / "data", num=20)
-    assert re.search(printed, run_python(EXAMPLES / example, data, tmp_path / "run"))
+    assert re.search(printed, run_here(example, data, tmp_path / "run"))
     assert (tmp_path / "run" / "model.safetensors").is_file()
 
 

@@ -1,10 +1,7 @@
 import io
 import json
 import re
-import runpy
-import sys
 from contextlib import redirect_stdout
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ from foretrace.predictor import (
 )
 from foretrace.predictor.loading import PORTABLE, default_checkpoint
 from foretrace.predictor.states import state_size
-from test_examples import EXAMPLES, run_python
+from test_examples import EXAMPLES, run_here, run_python
 
 onnxruntime = pytest.importorskip("onnxruntime")
 onnx = pytest.importorskip("onnx")
@@ -94,19 +91,6 @@ def command(tmp_path_factory):
     return predictor, file, printed.getvalue()
 
 
-@pytest.fixture
-def run_example(monkeypatch, capsys):
-    """What the example prints of a file."""
-
-    def run(*file: Path) -> str:
-        monkeypatch.setattr(sys, "argv", ["run_onnx.py", *map(str, file)])
-        capsys.readouterr()
-        runpy.run_path(str(EXAMPLES / "run_onnx.py"), run_name="__main__")
-        return capsys.readouterr().out
-
-    return run
-
-
 @pytest.fixture(scope="module")
 def views():
     return fake_batch(np.random.default_rng(0), 6, num_samples=SAMPLES)
@@ -163,7 +147,7 @@ def test_a_file_tells_what_it_is(command):
     assert "Cholesky" not in "".join(node.op_type for node in model.graph.node)
 
 
-def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path, monkeypatch, run_example):
+def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path, monkeypatch):
     predictor = image_cnn()
     monkeypatch.setattr(exporting, "BATCHES", (1, 5))
     written = exporting.export_onnx(predictor, tmp_path / "model.onnx")
@@ -183,11 +167,11 @@ def test_a_network_of_views_is_exported_with_its_convolutions(tmp_path, monkeypa
     np.testing.assert_allclose(path, imagined.com, atol=1e-5)
     np.testing.assert_allclose(rotation, quaternion_to_matrix(imagined.pose[..., 3:]), atol=1e-5)
 
-    assert "the centre of mass ends at [" in run_example(written.path)
+    assert "the centre of mass ends at [" in run_here("run_onnx.py", written.path)
 
 
 @pytest.mark.parametrize("content", ["missing", "text", "another model"])
-def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path, run_example):
+def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path):
     file = tmp_path / "model.onnx"
     if content == "text":
         file.write_text("hello")
@@ -199,26 +183,26 @@ def test_the_example_refuses_in_one_line_what_is_no_predictor(content, tmp_path,
         onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), file)
     told = "is missing or no predictor: give a file that `foretrace export onnx` wrote"
     with pytest.raises(SystemExit) as ended:
-        run_example(file)
+        run_here("run_onnx.py", file)
     assert ended.value.code == f"{file} {told}"  # Python writes it to standard error, and ends with 1
 
 
 @pytest.mark.slow
-def test_the_file_of_the_package_is_that_of_its_predictor(run_example):
+def test_the_file_of_the_package_is_that_of_its_predictor():
     """Its noise is badly conditioned: file and PyTorch both stray from float64."""
     network = network_of(load_predictor())
     written = exporting.compare(network, default_checkpoint() / PORTABLE, np.random.default_rng(0))
     assert set(written) == set(network.outputs)
-    assert re.search(r"^\d+%: .*\nthe centre of mass ends at \[", run_example())
+    assert re.search(r"^\d+%: .*\nthe centre of mass ends at \[", run_here("run_onnx.py"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("label", ["sc-200", "sp-truth"])
-def test_the_example_runs_with_other_features(label, tmp_path, run_example):
+def test_the_example_runs_with_other_features(label, tmp_path):
     predictor = LstmPredictor(LstmConfig(features=label, state="position", hidden=4), 2)
     predictor.eval()
     written = exporting.export_onnx(predictor, tmp_path / "model.onnx")
-    said = run_example(written.path)
+    said = run_here("run_onnx.py", written.path)
     assert ("zeros stand in" in said) == (label == "sp-truth")
     assert "the centre of mass ends at [" in said
 
