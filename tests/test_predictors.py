@@ -178,9 +178,9 @@ def test_four_lever_ups_are_learned_by_heart(label, batch):
     config = CASES[label]
     four = batch[np.flatnonzero(batch.outcome == "levered")[:4]]
     rows = np.arange(4)
-    options = {"width": 8, "dropout": 0.0} if config.features == "im-cnn" else config.feature_options
+    options = {"width": 4, "dropout": 0.0} if config.features == "im-cnn" else config.feature_options
     config = replace(config, hidden=32, feature_options=options)
-    training = TrainConfig(epochs=80, min_steps=1, batch_size=4, learning_rate=1e-2, split=None, threads=1)
+    training = TrainConfig(epochs=60, min_steps=1, batch_size=4, learning_rate=1e-2, split=None, threads=1)
     predictor, _ = fit_predictor(four, config, Split(rows, rows, rows), training)
     error = mean_distance(predictor.imagine_batch(four).com, four.com).mean()
     still = mean_distance(np.repeat(four.com[:, :1], SAMPLES, axis=1), four.com).mean()
