@@ -32,7 +32,7 @@ from foretrace.interactions.splits import split_by_seed
 from foretrace.objects import FOOTINGS, NO_BEVEL, Footed, HullShape, Prism, object_from_dict
 from foretrace.predictor import TrainConfig, fit_predictor
 from foretrace.simulation.sliding import Footprint, slide
-from foretrace.twin import sliding_constants
+from foretrace.twin import sliding_constants, sliding_residual
 from foretrace.twin.sliding import SlidingTwin
 from foretrace.twin.sliding_constants import Change
 from foretrace.twin.sliding_residual import PushRegions, PushResidual, push_errors
@@ -176,7 +176,8 @@ def test_a_change_of_circumstances_changes_a_push(tmp_path):
         assert np.abs(twin.predict(pushes, change) - twin.predict(pushes)).max() > 1e-4
 
 
-def test_corrections_are_learned_and_their_regions_hold(tmp_path):
+def test_corrections_are_learned_and_their_regions_hold(tmp_path, monkeypatch):
+    monkeypatch.setattr(sliding_residual, "FOLDS", 3)
     # The world pushes everything 3 mm farther than the twin says.
     pushes = read_pushes(*write_push_table(tmp_path, 260, farther=0.003, noise=2e-4))[0]
     learn, test = pushes[:160], pushes[160:]

@@ -236,7 +236,13 @@ def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
     low, high = figures["varies"]["height"]
     assert 0.015 <= low < 0.016 < 0.024 < high <= 0.025
     assert examine(varied).findings == ()
-    collect(PLAIN, tmp_path / "plain", workers=1, console=Console(quiet=True), simulate=fake_trial)
+    collect(
+        replace(PLAIN, objects=1),
+        tmp_path / "plain",
+        workers=1,
+        console=Console(quiet=True),
+        simulate=fake_trial,
+    )
     assert describe_dataset(Dataset.open(tmp_path / "plain")[:5])["varies"] == {}
     manifest = storage.read_manifest(varied)
     for name in manifest["shards"]:
@@ -250,11 +256,13 @@ def test_describe_and_doctor_know_what_varies(varied, tmp_path, capsys):
 
 
 def test_a_plain_folder_is_not_gone_on_with_randomised(tmp_path):
-    collect(PLAIN, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
+    collect(replace(PLAIN, objects=1), tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
     with pytest.raises(
         DatasetError, match=r"begun with randomisation\.bevel_height_factor = None, asked for"
     ):
-        collect(VARIED, tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial)
+        collect(
+            replace(VARIED, objects=1), tmp_path, workers=1, console=Console(quiet=True), simulate=fake_trial
+        )
 
 
 def test_simulate_randomise_from_the_command_line(tmp_path):
