@@ -71,6 +71,6 @@ def test_workers_that_wait_for_room_in_a_pipe_end_with_their_parent():
 def test_a_killed_simulation_leaves_no_process(tmp_path, moment):
     fast = ["--embodiment", "tool", "--insert-time", "0.1", "--lift-time", "0.2", "--hold-time", "0"]
     process = start(["-m", "foretrace", "simulate", "--out", str(tmp_path / "data"), *fast, "--workers", "2"])
-    time.sleep(random.Random(moment).uniform(0.5, 8.0))
+    time.sleep(random.Random(moment).uniform(0.5, 5.0))
     assert process.poll() is None
     assert not left_after_a_kill(process)
