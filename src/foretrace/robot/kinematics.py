@@ -52,6 +52,9 @@ class ArmKinematics:
         fixed = [model.body(name).id for name in FIXED_BODIES]
         moving = [g for g in range(model.ngeom) if model.geom_bodyid[g] not in fixed]
         self._capsules = [g for g in moving if model.geom_type[g] == capsule]
+        signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]), axis=-1).reshape(8, 3)
+        self._blade_corners = signs * model.geom("blade").size
+        self._tip = model.site("tip").id
         # The scene's origin is the contact point; its axes are the base's.
         self._base = np.array(arm.BASE_POSITION)
 
@@ -74,11 +77,10 @@ class ArmKinematics:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         jacobian, tip = np.zeros((6, model.nv)), data.site("tip")
-        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site("tip").id)
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._tip)
         axes = data.geom_xmat[self._capsules].reshape(-1, 3, 3)[:, :, 2]
         half = axes * model.geom_size[self._capsules, 1, None]
         middles = data.geom_xpos[self._capsules] - self._base
-        signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]), axis=-1).reshape(8, 3)
         blade = data.geom("blade")
         T_base_blade = rigid_transform(blade.xmat.reshape(3, 3), blade.xpos - self._base)
         return Posture(
@@ -88,7 +90,7 @@ class ArmKinematics:
             jacobian=jacobian,
             links=np.concatenate([middles - half, middles + half]),
             link_radii=np.tile(model.geom_size[self._capsules, 0], 2),
-            blade=transform_points(T_base_blade, signs * model.geom("blade").size),
+            blade=transform_points(T_base_blade, self._blade_corners),
         )
 
     def along(self, joints: Float[np.ndarray, "time 6"]) -> list[Posture]:
