@@ -105,6 +105,15 @@ def test_an_episode_ends_where_the_object_lies_on_another_side():
     assert "another side" in info["lost"]
 
 
+def test_a_function_of_motions_is_never_reached():
+    """It has costs alone, so an episode lasts until it is cut off."""
+    made = environment.LeverUpEnv(lambda motions: -motions.shift[..., 0], steps=2)
+    made.reset(seed=2, options={"object": BOX})
+    found = [made.step(np.array([-0.9, 0.0], dtype=np.float32)) for _ in range(2)]
+    assert [each[2:4] for each in found] == [(False, False), (False, True)]
+    assert not any(each[4]["reached"] for each in found)
+
+
 def triangle(rng):
     return ft.sample_prism(rng, 3)
 
@@ -152,12 +161,30 @@ def test_a_plan_is_the_action_that_it_means():
         (lambda: _after_reset().step(np.full(2, np.nan, np.float32)), "finite numbers"),
         (lambda: environment.LeverUpEnv().reset(options={"object": 3}), "object of type int"),
         (lambda: environment.LeverUpEnv(steps=0), "steps is 0: give a whole number from 1 to 20"),
+        (lambda: environment.LeverUpEnv(ft.goals.Learn()), "about what is believed"),
+        (lambda: environment.ImaginedCost(ft.goals.Lift() + ft.goals.Learn()), "about what is believed"),
+        (lambda: unchecked("reset")(_after_reset(), options=["cup"]), "options of type list"),
+        (lambda: unchecked("lever_up")(_after_reset(), "left"), "the action is 'left': give"),
+        (
+            lambda: environment.LeverUpEnv(ft.goals.MoveTo((5, 5))).reset(options={"object": BOX}),
+            "cannot be taken: .* outside what one view shows",
+        ),
+        (
+            lambda: environment.LeverUpEnv(ft.goals.KeepUpright(), steps=2).reset(options={"object": BOX}),
+            r"the goal KeepUpright\(\) is reached already",
+        ),
         (lambda: environment.LeverUpEnv(steps=3), "a goal about where it lies"),
     ],
 )
 def test_mistakes_are_told_in_one_line(make, message):
     with pytest.raises(PlanningError, match=message):
         make()
+
+
+def unchecked(name):
+    """A method without the tests' checks of types."""
+    method = getattr(environment.LeverUpEnv, name)
+    return getattr(method, "__wrapped__", method)
 
 
 def _after_reset():

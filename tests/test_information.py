@@ -166,6 +166,12 @@ def test_the_same_seed_gives_the_same():
         (lambda: goals.Learn(at_least=-1.0), PlanningError, "at_least is -1.0"),
         (lambda: information_gain(VIEW, [], ONE, imaginer=Slide()), PredictionError, "no candidate"),
         (lambda: gains(Slide(turns=False), ONE), MonitoringError, "positions alone"),
+        (lambda: unchecked(VIEW, [], ONE, seed="a"), MonitoringError, "seed is 'a': give a whole number"),
+        (
+            lambda: information_gain(VIEW, [], ONE, seed=-1),
+            MonitoringError,
+            "seed is -1: give a whole number",
+        ),
         (lambda: unchecked(VIEW, [], {"friction": 1}), MonitoringError, "belief of type dict"),
     ],
 )

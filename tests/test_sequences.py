@@ -221,6 +221,10 @@ BAD = {
         lambda: plan_sequence(PLATE, ft.goals.MoveTo((0.0, 0.0)), 2, TWIN),
         r"the goal MoveTo\(position=\(0, 0\)\) is reached already: give another one",
     ),
+    "a function": (
+        lambda: plan_sequence(PLATE, lambda motions: -motions.shift[..., 0], 2, TWIN),
+        "is a function, which does not tell when it is reached",
+    ),
     "a lift": (
         lambda: plan_sequence(PLATE, ft.goals.Lift(), 2),
         r"the goal Lift\(\) is about an object that is levered, a sequence ends with the object at rest",

@@ -6,10 +6,12 @@ from jaxtyping import Float
 
 from foretrace.actions import Action, LeverUp, ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
+from foretrace.errors import PlanningError
 from foretrace.geometry import cross, inward_normals
 from foretrace.imagined.context import CONSTANTS, nominal_constants
 from foretrace.interactions.record import Physics
 from foretrace.interactions.topdown import TopDownView
+from foretrace.planning.goals import Goal, describe
 
 CONE = 0.2
 """Largest angle of a lever-up to the inward normal [rad]."""
@@ -19,6 +21,19 @@ BROKEN = 1.0
 """What each thing that must not happen costs, where it happens."""
 TOLD = tuple(name for name in CONSTANTS if name in Physics.__dataclass_fields__)
 """Constants that are observed."""
+
+
+def check_goal(goal: Goal) -> None:
+    """Refuse a goal that is not about motions.
+
+    Raises:
+        PlanningError: It is about what is believed.
+    """
+    if goal.needs_gain():
+        raise PlanningError(
+            f"the goal {describe(goal)} is about what is believed of the object, which nothing is in an environment: "
+            "give a goal about its motion, such as foretrace.goals.Lift()"
+        )
 
 
 def observed_view(observation: dict[str, np.ndarray]) -> TopDownView:

@@ -11,6 +11,7 @@ from foretrace.environment.coding import (
     BROKEN,
     REFUSED,
     TOLD,
+    check_goal,
     decode_action,
     observed_context,
     observed_view,
@@ -39,6 +40,7 @@ class ImaginedCost:
         self, goal: Goal | Callable[..., Any] | None = None, imaginer: Imaginer | None = None
     ) -> None:
         self.goal = goals.Lift() if goal is None else as_goal(goal)
+        check_goal(self.goal)
         check_type("imaginer", imaginer, (Imaginer, type(None)), PlanningError, "an imaginer of lever-ups")
         self.imaginer = load_imaginer() if imaginer is None else imaginer
 

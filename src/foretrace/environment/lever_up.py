@@ -1,6 +1,6 @@
 """See an object from above, choose a lever-up, and be rewarded by a goal."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from foretrace.actions import FAILED, LeverUp
 from foretrace.actions.lever_up import VARIED_ACTION
-from foretrace.environment.coding import BROKEN, REFUSED, TOLD, decode_action, encode_action
+from foretrace.environment.coding import BROKEN, REFUSED, TOLD, check_goal, decode_action, encode_action
 from foretrace.errors import ForetraceError, PlanningError, check_type, fault, is_whole, shown
 from foretrace.geometry import invert_transform, transform_points
 from foretrace.imagined import Futures, ImaginedBatch
@@ -23,7 +23,7 @@ from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, sample_prism
 from foretrace.planning import Motions, Plan, goals
 from foretrace.planning.candidates import LOOK_AHEAD, Candidates, Scene, find_free
-from foretrace.planning.goals import Goal, as_goal
+from foretrace.planning.goals import Goal, as_goal, describe
 from foretrace.planning.goals.base import LEVERED
 from foretrace.planning.resting import com_of, judge_rest
 from foretrace.planning.sequence import MOST_STEPS
@@ -98,9 +98,9 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
 
     With one step, an episode is one lever-up, and its reward is minus the goal's cost. With several, the blade sets the
     object down again after each lever-up, the camera stays, and the reward is by how much the cost of where the object
-    lies falls. The episode ends when the goal is reached, when the object lies on another side, and when it leaves the
-    view; it is cut off after the last step. In both cases each thing that happens and must not costs `BROKEN`, and a
-    contact that no blade gets to earns `REFUSED`.
+    lies falls. The episode ends when the goal is reached, which functions of motions do not tell, when the object lies
+    on another side, and when it leaves the view; it is cut off after the last step. In both cases each thing that
+    happens and must not costs `BROKEN`, and a contact that no blade gets to earns `REFUSED`.
 
     Args:
         goal: What is rewarded, in the view's frame: a goal, or a function of motions that returns costs.
@@ -112,7 +112,8 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
         steps: Lever-ups of an episode, at most.
 
     Raises:
-        PlanningError: An argument is none of these, or several steps have a goal about an object on the blade.
+        PlanningError: An argument is none of these, the goal is about what is believed, or several steps have a goal
+            about an object on the blade.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 1}  # noqa: RUF012
@@ -132,6 +133,7 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
                 f"steps is {shown(steps)}: give a whole number from 1 to {MOST_STEPS}"
             )
         self.goal = goals.Lift() if goal is None else as_goal(goal)
+        check_goal(self.goal)
         if steps > 1 and LEVERED in self.goal.needed_outcomes():
             raise PlanningError(
                 f"steps is {steps}, and the goal is about an object on the blade: give a goal about where it lies, "
@@ -139,6 +141,8 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
             )
         if objects is not None and not callable(objects):
             raise fault(PlanningError, False)(f"objects of type {type(objects).__name__}: give a function")
+        for name, value in (("randomise", randomise), ("vary_path", vary_path)):
+            check_type(name, value, bool, PlanningError, "True or False")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise PlanningError(f"render_mode is {render_mode!r}: choose rgb_array or human")
         self.objects = objects or _draw_prism
@@ -164,9 +168,17 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Draw an object, the place of the camera and the physics; ``options={"object": model}`` gives the object."""
+        """Draw an object, the place of the camera and the physics; ``options={"object": model}`` gives the object.
+
+        What does not fit into the view, cannot have the goal, or has reached it already before several steps, is drawn
+        anew.
+
+        Raises:
+            PlanningError: None of 100 objects will do, or the given one does not.
+        """
+        check_type("options", options, (Mapping, type(None)), PlanningError, '{"object": model}')
         super().reset(seed=seed)
-        rng, given = self.np_random, (options or {}).get("object")
+        rng, given, reason = self.np_random, (options or {}).get("object"), ""
         for _ in range(100):
             obj = self.objects(rng) if given is None else given
             check_type("object", obj, ObjectModel, PlanningError)
@@ -176,18 +188,32 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
             camera = LeverUp(middle - LOOK_AHEAD * way, way)
             try:
                 scene = Scene.of(TopDownView.of(obj, camera))
+                self._check(scene)
                 break
             except ForetraceError as error:
                 if given is not None:
-                    raise PlanningError(f"the object cannot be shown: {error}") from error
+                    raise PlanningError(f"this object cannot be taken: {error}") from error
+                reason = str(error)
         else:
-            raise PlanningError("no object of 100 drawn ones fits into the view: draw smaller ones")
+            raise PlanningError(f"none of 100 drawn objects can be taken; the last one: {reason}")
         physics = Physics()
         if self.randomise:
             physics = Physics(**{name: float(rng.uniform(*getattr(RANDOMISED, name))) for name in TOLD})
         world = SimulatedWorld(obj, replace(self.config, physics=physics))
         self.episode = Episode(obj, camera, scene, scene, physics, world)
         return self._observation(), {"object": obj, "physics": physics}
+
+    def _check(self, scene: Scene) -> None:
+        """Refuse a goal that this object cannot have, or has reached before the first of several steps.
+
+        Raises:
+            PlanningError: Naming it.
+        """
+        self.goal.check(scene.outline)
+        if self.steps == 1 or not self.goal.tells_reached():
+            return
+        if judge_rest(self.goal, scene, com_of(scene), np.eye(4)).reached:
+            raise PlanningError(f"the goal {describe(self.goal)} is reached already: give another one")
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Lever the object up.
@@ -240,7 +266,7 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
         way = frames @ invert_transform(now.camera.T_action_object)
         now.last = lever, np.array([transform_points(each, com[None])[0, :2] for each in way])
         info |= {"cost": after.cost, "T_start_now": now.T_start_now, "broken": list(after.broken)}
-        info["reached"] = after.reached and not after.broken
+        info["reached"] = after.reached and not after.broken and self.goal.tells_reached()
         ended = info["reached"]
         try:
             now.look()
@@ -250,7 +276,13 @@ class LeverUpEnv(gymnasium.Env[Any, np.ndarray]):
 
     def lever_up(self, action: np.ndarray) -> LeverUp:
         """The lever-up that an action means, in the view's frame."""
-        values = np.asarray(action, dtype=float)
+        try:
+            values = np.asarray(action, dtype=float)
+        except (TypeError, ValueError):
+            wanted = self.action_space.shape
+            raise fault(PlanningError, False)(
+                f"the action is {shown(action)}: give {wanted} finite numbers"
+            ) from None
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise PlanningError(
                 f"the action has the shape {values.shape}: give {self.action_space.shape} finite numbers"

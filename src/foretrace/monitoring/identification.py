@@ -116,7 +116,7 @@ def identify(
     return belief.updated(values, weights)
 
 
-def check_seed(seed: int) -> None:
+def check_seed(seed: object) -> None:
     """Refuse what is no seed.
 
     Raises:

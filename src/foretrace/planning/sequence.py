@@ -269,6 +269,11 @@ def _begin(seen: Any, goal: Any, steps: int, com: Numbers | None) -> tuple[Goal,
             f"the goal {describe(aim)} is about an object that is {LEVERED}, a sequence ends with the object at rest: "
             "give a goal about where it lies, or plan a single action"
         )
+    if not aim.tells_reached():
+        raise PlanningError(
+            f"the goal {describe(aim)} is a function, which does not tell when it is reached: add a goal that does, or "
+            "plan a single action"
+        )
     if com is not None:
         scene = scene.loaded(finite_array("com (x, y, z) [m]", com, (3,), PlanningError))
     return aim, scene

@@ -90,6 +90,10 @@ class Goal(ABC):
         """Whether it can only be had with a belief, see `asks_gain`."""
         return self.asks_gain
 
+    def tells_reached(self) -> bool:
+        """Whether `reached` tells anything: a function of motions has costs alone."""
+        return True
+
     def __add__(self, other: Any) -> "Total":
         return Total(_terms(self) + _terms(as_goal(other)))
 
@@ -138,6 +142,10 @@ class Total(Goal):
         """Whether any does."""
         return any(goal.needs_gain() for _, goal in self.terms)
 
+    def tells_reached(self) -> bool:
+        """Whether any does."""
+        return any(goal.tells_reached() for _, goal in self.terms)
+
     def __str__(self) -> str:
         return " + ".join(
             f"{'' if weight == 1 else f'{weight:g} '}{describe(goal)}" for weight, goal in self.terms
@@ -174,6 +182,10 @@ class Own(Goal):
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Always: only its cost is known."""
         return np.ones(motions.probability.shape, dtype=bool)
+
+    def tells_reached(self) -> bool:
+        """No."""
+        return False
 
     def __str__(self) -> str:
         return getattr(self.function, "__name__", type(self.function).__name__)
