@@ -1,5 +1,6 @@
 """Poses of trackers: tables, bags of ROS, and a plan that is watched with them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +131,10 @@ def test_a_plan_is_watched_with_poses_in_either_frame(tmp_path: Path, capsys, mo
         said.append(capsys.readouterr().out)
     assert said[0] == said[1]
     assert said[0].startswith("no alarm")
+    replace(plan, action=ft.Push(plan.action.contact, plan.action.direction)).save("push.json")
+    push = ["monitor", "push.json", "--poses", "own.csv", "--worlds", "16", "--out", "watched.png"]
+    assert main(push) == 2
+    assert "push.json plans a push, and the one-shot predictor imagines a lever-up" in capsys.readouterr().err
     table = np.column_stack([effect.times, effect.pose_trajectory])
     for name, by in (("ms", [1e3] + [1] * 7), ("off", [1] * 4 + [2] * 4)):
         np.savetxt(f"{name}.csv", table * by, delimiter=",", header=HEAD, comments="")

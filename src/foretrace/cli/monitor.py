@@ -147,7 +147,13 @@ def _watch_plan(
         )
     times, poses = _poses_since_start(track, plan.action.duration)
     lost = np.isnan(poses[:, 0])
-    plan = plan.imagined_by(load_imaginer(run), belief)
+    imaginer = load_imaginer(run)
+    if not isinstance(plan.action, imaginer.action):
+        raise MonitoringError(
+            f"{file} plans a {plan.action.label}, and the {imaginer.name} predictor imagines a "
+            f"{imaginer.action.label}: give --run with one of a {plan.action.label}, or use ft.Monitor in Python"
+        )
+    plan = plan.imagined_by(imaginer, belief)
     watching = Monitor(plan, false_alarms, T_table_action=T_table_action, calibration=calibration)
     verdicts = [
         watching.update(float(t), None if gone else pose)
