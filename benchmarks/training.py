@@ -104,19 +104,19 @@ def lightning_steps(label: str, config: LstmConfig, repeats: int) -> list[float]
     seconds: list[float] = []
 
     class Module(pl.LightningModule):
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             self.network = PlainPredictor(label, config.hidden, num_features)
             self.began = perf_counter()
 
-        def training_step(self, batch: Any, number: int) -> Tensor:
+        def training_step(self, batch, number):
             given, states = batch
             return (self.network(given, states[:, :-1]) - states[:, 1:]).square().mean()
 
-        def configure_optimizers(self) -> torch.optim.Optimizer:
+        def configure_optimizers(self):
             return torch.optim.Adam(self.parameters())
 
-        def on_train_batch_end(self, *_: Any) -> None:
+        def on_train_batch_end(self, *_):
             seconds.append(perf_counter() - self.began)
             self.began = perf_counter()
 
