@@ -42,8 +42,6 @@ MARK = "FORETRACE_NODE"
 """Variable of the environment that finds the processes of a node."""
 OBJECTS = 32
 """416 lever-ups in five shards."""
-SPEED_OBJECTS = 30
-"""378 lever-ups in four shards, two for each of two workers."""
 COMMAND = f"simulate --objects {OBJECTS} --embodiment tool --out"
 TARGETS = ("worker", "worker", "node", "node", "head", "command", "command", "ctrl-c")
 LIMIT = 300.0
@@ -64,6 +62,8 @@ class Options:
     """Time after which no kill is begun [min]."""
     rounds: int = 3
     """Repetitions of each time that is measured."""
+    objects: int = 90
+    """Objects of the simulations that are timed, some 12 lever-ups of each."""
     seed: int = 0
     """Seed of moments and victims."""
     folder: Path = ROOT / "build" / "cluster"
@@ -273,7 +273,7 @@ def nothing(job: int) -> tuple[str, dict[str, Any], Counter[str]]:
 
 def speed(options: Options) -> int:
     """Times of the same work with and without Ray, in turns; exit status."""
-    config = CollectConfig(SPEED_OBJECTS, simulation=SimulationConfig(embodiment="tool"))
+    config = CollectConfig(options.objects, simulation=SimulationConfig(embodiment="tool"))
     times: dict[str, list[float]] = {}
 
     def measure(name: str, workers: int) -> None:
