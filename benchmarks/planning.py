@@ -1,6 +1,6 @@
 """How long a plan takes from the view on: learned alone, and with the best eight checked by the twin; on one core.
 
-    python benchmarks/planning.py --out docs/results/planning/times.json
+    python benchmarks/planning.py --out docs/results/planning-times.json
 
 Objects are drawn as in `foretrace evaluate planning`; each is planned for every goal with its 40 contacts, without
 refinement, and as `foretrace.plan` does by default. Run it on an idle machine.
