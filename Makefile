@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/installed
-LOCKED := $(BIN)/pip install --quiet --require-hashes --no-deps
+LOCKED := $(BIN)/pip install --quiet $(PIP_OPTIONS) --require-hashes --no-deps
 OPTIONAL := ^(pybullet|pyrealsense2|ray|rerun-sdk|rosbags|ur-rtde|onnx|onnxscript)==
 
 # `make quick`: these files without their slow tests, under 45 seconds on two idle cores.
@@ -12,14 +12,14 @@ QUICK := actions arm checkpoint cli dataset features geometry golden lever_up me
 
 setup: $(STAMP)
 
-# Every package is the file that requirements.lock names by its checksum; torch alone is another file on machines with
+# Every package is the file that requirements.lock names by its checksum, installed with PIP_OPTIONS; torch alone is another file on machines with
 # and without a GPU, and its version is in constraints.txt. The lines of OPTIONAL packages wait: some have no wheels for
 # some machines.
 $(STAMP): pyproject.toml requirements.lock constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
 	grep -vE '$(OPTIONAL)' requirements.lock > .venv/packages.txt
 	$(LOCKED) -r .venv/packages.txt
-	$(BIN)/pip install --quiet --constraint constraints.txt torch
+	$(BIN)/pip install --quiet $(PIP_OPTIONS) --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
 	grep -E '$(OPTIONAL)' requirements.lock | while read -r line; do \
 		echo "$$line" > .venv/package.txt; \
