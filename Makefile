@@ -12,9 +12,9 @@ QUICK := actions arm checkpoint cli dataset features geometry golden lever_up me
 
 setup: $(STAMP)
 
-# Every package is the file that requirements.lock names by its checksum, installed with PIP_OPTIONS; torch alone is another file on machines with
+# Every package is the file that requirements.lock names by its checksum; torch alone is another file on machines with
 # and without a GPU, and its version is in constraints.txt. The lines of OPTIONAL packages wait: some have no wheels for
-# some machines.
+# some machines. PIP_OPTIONS is what pip is told besides.
 $(STAMP): pyproject.toml requirements.lock constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
 	grep -vE '$(OPTIONAL)' requirements.lock > .venv/packages.txt
