@@ -168,12 +168,7 @@ def _watch_plan(
     moved = seen @ invert_transform(seen[0])
     rest, middle = plan.action.T_action_object, plan.imagined.com_trajectory[:1]
     com = np.array([transform_points(each, middle)[0] for each in moved])
-    obj = plan.object
-    if obj is None:
-        from foretrace.objects import Prism
-
-        obj = Prism(plan.outline, plan.height)
-    scene = Scene.imagined(obj, plan.action, times, {}, matrix_to_pose(moved @ rest))
+    scene = Scene.imagined(plan.shown_object, plan.action, times, {}, matrix_to_pose(moved @ rest))
     scene = replace(scene, com=com, title=f"{plan.goal}: {track.poses.name}")
     return _Watched(scene, plan.imagined, verdicts, np.where(lost[:, None], np.nan, com))
 

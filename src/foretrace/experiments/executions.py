@@ -20,6 +20,7 @@ from foretrace.geometry import (
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
 )
+from foretrace.imagined import ObservedMotion
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, Prism, Weighted, sample_prism
@@ -274,6 +275,15 @@ def track(
         way = rng.normal(size=3)
         seen[when:, :3] += rng.uniform(0.005, 0.02) * way / np.linalg.norm(way)
     return tuple(None if gone else pose for gone, pose in zip(lost, seen, strict=True))
+
+
+def observed(
+    poses: Float[np.ndarray, "time 7"], times: Float[np.ndarray, " time"], rng: np.random.Generator
+) -> ObservedMotion:
+    """What the tracker sees of an execution without a fault, see `track`; lost poses are left out."""
+    tracked = track(poses, times, "", rng)
+    seen = [row for row, pose in enumerate(tracked) if pose is not None]
+    return ObservedMotion(times[seen], np.array([tracked[row] for row in seen]))
 
 
 def _points(poses: Float[np.ndarray, "time 7"], point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "time 3"]:

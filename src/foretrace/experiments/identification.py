@@ -18,17 +18,17 @@ from foretrace.actions import LeverUp
 from foretrace.errors import ResultsError, ShapeError, ViewError
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.experiments import SUMMARIES
-from foretrace.experiments.executions import PERIOD, Scene, track
+from foretrace.experiments.executions import PERIOD, Scene, observed
 from foretrace.experiments.identification_report import NAMES, figures, report, summarise
 from foretrace.experiments.monitor_calibration import predictor
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import Belief, ObservedMotion
-from foretrace.imagined.belief import COM, RANGES
+from foretrace.imagined.belief import RANGES
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import identify
-from foretrace.monitoring.identification import COM_RANGE
+from foretrace.monitoring.identification import first_prior
 from foretrace.objects import Prism, Weighted, sample_prism
 from foretrace.planning import goals, plan
 from foretrace.predictor.loading import default_checkpoint
@@ -39,8 +39,6 @@ LEARNED_FROM, TRIED = 3, 3
 Choice = Literal["random", "chosen"]
 CHOICES: tuple[Choice, ...] = ("random", "chosen")
 """How lever-ups that are learned from are chosen: at random places, or by what they are expected to tell."""
-PRIOR = Belief(dict.fromkeys(COM, (-COM_RANGE, COM_RANGE)))
-"""What is believed of an object before its first lever-up, as `identify` takes it."""
 LARGEST_OFFSET = 0.02
 """Largest offset of the centre of mass [m]."""
 CM, MM = 100.0, 1000.0
@@ -94,7 +92,7 @@ class Identification(Experiment):
         rng = np.random.default_rng([self.seed, trial.object])
         case = _draw(rng)
         rows: list[Row] = []
-        belief = PRIOR
+        belief = first_prior()
         learning = choosing = 0.0
         twin = TwinImaginer(config=TwinConfig(workers=1)) if self.exact else None
         for k in range(self.lever_ups):
@@ -150,9 +148,7 @@ class Case:
     def observe(self, action: LeverUp, rng: np.random.Generator) -> ObservedMotion:
         """What a tracker sees of a lever-up."""
         poses = self.play(action, rng)
-        tracked = track(poses, PERIOD * np.arange(len(poses)), "", rng)
-        seen = np.array([j for j, pose in enumerate(tracked) if pose is not None])
-        return ObservedMotion(PERIOD * seen, np.array([tracked[j] for j in seen]))
+        return observed(poses, PERIOD * np.arange(len(poses)), rng)
 
     def play(self, action: LeverUp, rng: np.random.Generator) -> np.ndarray:
         """(time, 7) Poses of the object frame in the action frame, with an execution error."""

@@ -22,12 +22,12 @@ from foretrace.actions import FAILED, Action, LeverUp, ToolPath
 from foretrace.errors import ForetraceError, ResultsError
 from foretrace.evaluation.experiment import Experiment, Row, Trial, chosen
 from foretrace.experiments import SUMMARIES
-from foretrace.experiments.executions import track
+from foretrace.experiments.executions import observed
 from foretrace.experiments.planning_report import GOALS, METHODS, draw, report_of, summary_of
 from foretrace.experiments.planning_rules import ClosedForm, choose_by_rule
 from foretrace.experiments.transfer_objects import Subject, read_silhouettes
 from foretrace.files import short_hash
-from foretrace.imagined import Belief, Futures, ImaginedBatch, Imaginer, ObservedMotion, estimate_com
+from foretrace.imagined import Belief, Futures, ImaginedBatch, Imaginer, estimate_com
 from foretrace.imagined.observed import rotations_since_rest
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Interaction, Physics
@@ -325,9 +325,7 @@ class Case:
             rng = np.random.default_rng(self.seed)
             k = rng.choice([k for k, each in enumerate(self.elsewhere) if each.effect.outcome != FAILED])
             action, effect = self.placed[k], self.elsewhere[k].effect
-            tracked = track(effect.pose_trajectory, effect.times, "", rng)
-            seen = [row for row, pose in enumerate(tracked) if pose is not None]
-            motion = ObservedMotion(effect.times[seen], np.array([tracked[row] for row in seen]))
+            motion = observed(effect.pose_trajectory, effect.times, rng)
             view = TopDownView.of(self.obj, action)
             self._identified = identify(view, action, motion, BELIEVED, imaginer=imaginer)
         return self._identified

@@ -47,6 +47,11 @@ TAIL = 3.0
 """Degrees of freedom of the likelihood (Student): a few samples that are far off do not decide."""
 
 
+def first_prior() -> Belief:
+    """What is believed of an object before its first action: usual ranges, its centre of mass within `COM_RANGE`."""
+    return Belief(dict.fromkeys(COM, (-COM_RANGE, COM_RANGE)))
+
+
 def identify(
     view: TopDownView,
     action: Action,
@@ -90,7 +95,7 @@ def identify(
     motion = observed_motion(effect)
     imaginer = imaginer or IMAGINERS.find("learned")(None)
     imaginer.imagine(view, action)  # with its checks of the view
-    belief = prior or Belief(dict.fromkeys(COM, (-COM_RANGE, COM_RANGE)))
+    belief = prior or first_prior()
     com = estimate_com(InteractionBatch.from_views([view]))[0]
     parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}
     rng = np.random.default_rng(seed)

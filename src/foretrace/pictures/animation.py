@@ -16,14 +16,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from PIL import Image
 
-from foretrace.errors import PredictionError
-from foretrace.files import atomic_path
 from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject
 from foretrace.objects.surface import faces_of
+from foretrace.pictures.animation_files import write_animation
 from foretrace.pictures.scene import TOOL_REACH, Scene, Trace, draw_over_time, legend_of, tool_line
 from foretrace.pictures.style import (
     CM,
@@ -43,16 +41,12 @@ BLADE_WIDTH, BLADE_LENGTH = 0.0055, 0.045
 """The drawn blade [m]; a thinner shaft continues it."""
 DRAWN_FACETS = 4
 """Of a cylinder's facets every fourth edge is drawn, so that one sees it roll."""
-LAST_FRAME_TIME = 1.2
-"""How long an animation rests on its end before it repeats [s]."""
 TUBE_STRENGTH = 0.2
 """Opacity of the prediction region."""
 DASH = 8.0
 """Length of the dashes of predicted paths, and of the gaps between them [pixels]."""
 SUBPIXELS = 4
 """Bits of the fraction of a pixel to which shapes are drawn."""
-COLORS = 128
-"""Colours of a GIF."""
 
 
 def interaction_animation(
@@ -78,26 +72,6 @@ def scene_animation(scene: Scene, path: str | Path) -> Path:
     """The animation of `interaction_animation` for any scene."""
     period = float(np.median(np.diff(scene.times))) if len(scene.times) > 1 else 0.05
     return write_animation(Path(path), frames(scene), period)
-
-
-def write_animation(path: Path, pictures: Iterator[np.ndarray], period: float) -> Path:
-    """Write pictures (rows, columns, 3), uint8, as a GIF or MP4.
-
-    Args:
-        path: The file to write; its ending decides between ``.gif`` and ``.mp4``.
-        pictures: The pictures in order.
-        period: Time between them [s].
-
-    Raises:
-        PredictionError: The ending is unknown, or MP4 cannot be written here.
-    """
-    writers = {".gif": _write_gif, ".mp4": _write_mp4}
-    if path.suffix.lower() not in writers:
-        raise PredictionError(f"cannot write an animation to {path}: choose a name ending in .gif or .mp4")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as draft:
-        writers[path.suffix.lower()](draft, pictures, period)
-    return path
 
 
 def frames(
@@ -371,36 +345,3 @@ def _limits(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
     flat = project(np.concatenate(seen))[:, :2] * CM
     low, high = flat.min(axis=0) - 0.5, flat.max(axis=0) + 0.5
     return (low[0], high[0]), (low[1], high[1])
-
-
-def _write_gif(path: Path, pictures: Iterator[np.ndarray], period: float) -> None:
-    images = [Image.fromarray(picture) for picture in pictures]
-    palette = images[len(images) // 2].quantize(COLORS, dither=Image.Dither.NONE)
-    found = np.reshape(palette.getpalette() or [], (-1, 3))
-    found[(found > 245).all(axis=1)] = 255  # white was averaged with what is nearly white
-    palette.putpalette(found.ravel().tolist())
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    durations = [round(1000 * period)] * (len(images) - 1) + [round(1000 * LAST_FRAME_TIME)]
-    first, *others = images
-    first.save(path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
-
-
-def _write_mp4(path: Path, pictures: Iterator[np.ndarray], period: float) -> None:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise PredictionError(
-            "cannot write MP4: it needs `pip install foretrace[video]`; or choose a .gif"
-        ) from error
-    shown = list(pictures)
-    height, width, _ = shown[0].shape
-    options: Any = {
-        "fps": 1 / period,
-        "macro_block_size": 2,
-        "output_params": ["-f", "mp4"],
-    }  # whatever the name
-    writer: Any = imageio_ffmpeg.write_frames(str(path), (width, height), **options)
-    writer.send(None)
-    for picture in [*shown, *[shown[-1]] * round(LAST_FRAME_TIME / period)]:
-        writer.send(np.ascontiguousarray(picture))
-    writer.close()

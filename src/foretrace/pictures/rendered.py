@@ -14,7 +14,7 @@ from foretrace.geometry import matrix_to_pose, planar_transform, pose_to_matrix
 from foretrace.imagined import ImaginedEffect
 from foretrace.imagined.shown import radius_of
 from foretrace.interactions.record import Interaction
-from foretrace.pictures.animation import write_animation
+from foretrace.pictures.animation_files import write_animation
 from foretrace.pictures.style import PREDICTION_COLORS, TRUTH_COLOR
 from foretrace.simulation.arm_parts import joints_along
 from foretrace.simulation.camera import make_renderer

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from foretrace.pictures.animation import write_animation
+from foretrace.pictures.animation_files import write_animation
 from foretrace.pictures.style import (
     CM,
     GREY,

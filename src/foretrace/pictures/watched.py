@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from foretrace.imagined import ImaginedEffect
 from foretrace.monitoring import Verdict
-from foretrace.pictures.animation import frames, write_animation
+from foretrace.pictures.animation import frames
+from foretrace.pictures.animation_files import write_animation
 from foretrace.pictures.scene import Ghost, Scene
 from foretrace.pictures.style import (
     CM,

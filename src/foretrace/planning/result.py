@@ -199,6 +199,11 @@ class Plan:
             )
         return replace(self.action, contact=T[:2, 3], direction=T[:2, 0])
 
+    @property
+    def shown_object(self) -> ObjectModel:
+        """The object, or a prism of its outline where a view alone was planned from."""
+        return self.object or Prism(self.outline, self.height)
+
     def imagined_by(self, imaginer: Imaginer, context: Context | Belief = None) -> "Plan":
         """The plan with its action imagined anew: a file keeps futures, but not the worlds of a belief.
 
@@ -210,7 +215,7 @@ class Plan:
             PredictionError: The imaginer does not imagine this action, or is not told such a context.
             ViewError: The object does not fit into the view.
         """
-        view = TopDownView.of(self.object or Prism(self.outline, self.height), self.action)
+        view = TopDownView.of(self.shown_object, self.action)
         return replace(self, imagined=imaginer.imagine(view, self.action, context=context))
 
     def __repr__(self) -> str:
