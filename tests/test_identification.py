@@ -73,6 +73,21 @@ def test_beliefs_multiply():
     assert twice.learned == once.learned or set(twice.learned) >= {"friction"}
 
 
+def test_the_contact_of_an_execution_to_come_may_be_off_by_as_much_as_before():
+    belief = ft.identify(VIEW, ACTION, observed(0.65, 0.012), imaginer=Slider())
+    shift = np.array([0.0, 0.0, -0.0025, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = belief.updated(
+        0.01 * belief.values + 0.99 * (np.array([*belief.mean.values()]) + shift), belief.weights
+    )
+    assert found.sample(512)["contact_left"].std() < 1e-4
+    drawn = found.sample_ahead(512)
+    low, high = found.ranges["contact_left"]
+    assert np.allclose(np.sort(drawn["contact_left"]), np.linspace(low, high, 512), atol=(high - low) / 256)
+    assert drawn["friction"].std() < 0.1 * found.prior_std["friction"]
+    worlds = Slider().imagine(VIEW, ACTION, context=found).worlds
+    assert np.ptp(worlds.values["contact_left"][:256]) > 0.98 * (high - low)
+
+
 def test_an_exact_imaginer_has_the_last_word():
     belief = ft.identify(VIEW, ACTION, observed(0.65, 0.0), imaginer=Slider(), exact=Slider())
     assert len(belief.values) == identification.BEST

@@ -19,8 +19,9 @@ from foretrace.interactions.hull import MAX_CORNERS, UNIT
 from foretrace.interactions.splits import Split
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE, TopDownView
 from foretrace.objects import sample_prism
-from foretrace.predictor import OneShotConfig, OneShotPredictor
+from foretrace.predictor import OneShotConfig, OneShotPredictor, one_shot
 from foretrace.predictor.mixture import along_edges
+from foretrace.predictor.parts import effects_of, features_of, prepare
 from foretrace.predictor.states import encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error
@@ -183,6 +184,35 @@ def test_an_interrupted_training_ends_with_the_same_model(batch, tmp_path, monke
     monkeypatch.undo()
     cut = train_predictor(batch, CONFIG, tmp_path / "cut", QUICK, split=everything(batch), progress=False)
     assert (cut / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+
+
+def test_motions_that_can_hardly_be_predicted_count_less(batch, monkeypatch):
+    monkeypatch.setattr(one_shot, "SCALE_WEIGHT", 0.0)
+    predictor = fit_predictor(batch, replace(CONFIG, error_weighting=0.5), everything(batch), QUICK)[0]
+    plain = fit_predictor(batch, CONFIG, everything(batch), QUICK)[0]
+    plain.load_state_dict(predictor.state_dict())
+    part = prepare(batch, predictor)
+    features, effects = features_of(part, predictor), effects_of(part, predictor)
+    slipped = effects.outcomes == 1
+    assert 0 < slipped.sum() < len(effects)
+    for each in (predictor, plain):  # the scales of all futures of an outcome are equal
+        last = each.networks
+        last.weights[-1].data.unflatten(0, (last.size, 2, -1))[:, :, -2] = 0
+        last.biases[-1].data.unflatten(0, (last.size, 2, -1))[..., -2] = torch.tensor([-3.0, -1.0])
+
+    def loss(which, rows):
+        torch.manual_seed(0)
+        return which.training_loss(features[rows], effects[rows])
+
+    rows = torch.arange(len(effects))
+    torch.testing.assert_close(loss(predictor, slipped), loss(plain, slipped))
+    counts = torch.where(slipped, np.exp(0.5), np.exp(1.5))
+    losses = torch.stack([loss(plain, rows[k : k + 1]) for k in range(len(rows))])
+    torch.testing.assert_close(
+        loss(predictor, rows), (counts * losses).sum() / counts.sum(), rtol=1e-4, atol=0
+    )
+    with pytest.raises(TrainingError, match="error_weighting"):
+        OneShotConfig(error_weighting=2.0)
 
 
 def test_futures_are_told_apart(batch, longer):

@@ -79,6 +79,8 @@ class Belief:
         """Standard deviations before anything was observed."""
         self.ranges: Mapping[str, tuple[float, float]] = limits
         """Ranges of the prior."""
+        self.is_prior = True
+        """Whether nothing was observed yet."""
 
     def updated(
         self, values: Float[np.ndarray, "particles names"], weights: Float[np.ndarray, " particles"]
@@ -89,6 +91,7 @@ class Belief:
             **{name: each for name, each in self.__dict__.items() if name not in ("mean", "std", "learned")},
             "values": values,
             "weights": weights / weights.sum(),
+            "is_prior": False,
         }
         return found
 
@@ -140,6 +143,26 @@ class Belief:
         moved = self.values[rows] + width * rng.normal(size=(n, len(self.names)))
         drawn = np.clip(moved, low, high)[rng.permutation(n)]
         return dict(zip(self.names, drawn.T, strict=True))
+
+    def sample_ahead(
+        self, n: int, rng: np.random.Generator | None = None
+    ) -> dict[str, Float[np.ndarray, " n"]]:
+        """As `sample`, of an execution to come: what differs between executions (`EXECUTION`) is not known of it.
+
+        Args:
+            n: Number of draws.
+            rng: Random numbers; by default always the same.
+
+        Raises:
+            PredictionError: n is no number from 1 on.
+        """
+        rng = np.random.default_rng(0) if rng is None else rng
+        drawn = self.sample(n, rng)
+        if not self.is_prior:
+            for name in EXECUTION:
+                low, high = self.ranges[name]
+                drawn[name] = low + (high - low) * (rng.permutation(n) + rng.random(n)) / n  # evenly spread
+        return drawn
 
 
 def _range(name: object, pair: Any) -> tuple[float, float]:

@@ -349,7 +349,7 @@ class Imaginer(ABC):
         if action is None:
             action = self.action.nominal()
         parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}
-        values, causes = wrong_worlds(belief.sample(belief.worlds))
+        values, causes = wrong_worlds(belief.sample_ahead(belief.worlds))
         played = play_worlds(self, view, action, com, values, parameters)
         count = belief.worlds
         futures = average_worlds(played.futures[np.arange(count)], count, com[None])
@@ -363,7 +363,7 @@ class Imaginer(ABC):
     ) -> ImaginedBatch:
         """The effects of several actions, averaged over a belief."""
         count = min(belief.worlds, CANDIDATE_WORLDS)
-        values = belief.sample(count)
+        values = belief.sample_ahead(count)
         parts, warnings = [], []
         for action, place in zip(actions, com, strict=True):
             parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}

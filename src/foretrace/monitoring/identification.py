@@ -11,7 +11,7 @@ from foretrace.actions import Action
 from foretrace.errors import MonitoringError, check_type, fault, is_whole, shown
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import IMAGINERS, Imaginer, ObservedMotion, estimate_com
-from foretrace.imagined.belief import COM, EXECUTION, Belief
+from foretrace.imagined.belief import COM, Belief
 from foretrace.imagined.context import parameters_of
 from foretrace.imagined.futures import ImaginedBatch
 from foretrace.imagined.observed import observed_motion, rotations_since_rest
@@ -99,9 +99,7 @@ def identify(
     com = estimate_com(InteractionBatch.from_views([view]))[0]
     parameters = {name: float(each[0]) for name, each in parameters_of([action]).items()}
     rng = np.random.default_rng(seed)
-    drawn = belief.sample(PARTICLES, rng)
-    for name in EXECUTION:  # errors of the contact belong to this execution alone
-        drawn[name] = rng.uniform(*belief.ranges[name], PARTICLES)
+    drawn = belief.sample_ahead(PARTICLES, rng)
     values = np.column_stack([drawn[name] for name in belief.names])
     limits = np.array([belief.ranges[name] for name in belief.names])
     worlds: dict[str, np.ndarray] = {}

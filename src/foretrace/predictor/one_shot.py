@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from foretrace.errors import TrainingError
+from foretrace.errors import TrainingError, check_ranges
 from foretrace.features import Outline, action_frame, pivot_edges
 from foretrace.features.outline import pixel_error
 from foretrace.features.pivot_edges import PROBES, PivotEdges
@@ -53,6 +53,8 @@ LARGEST_ERROR = 1.5
 """Logarithm of the largest error scale, in units of the position's: outputs for improbable futures are arbitrary."""
 SMALLEST_ERROR = -15.0
 """Logarithm of the smallest error scale that is learned: below, its likelihood would overflow for an odd lever-up."""
+LEAST_WEIGHTED = -7.0
+"""Logarithm of the error scale below which motions count no more than at it, see ``error_weighting``."""
 DISAGREEMENT = 8.0
 """Error scale per distance between the outputs of networks and mirror images.
 
@@ -78,6 +80,7 @@ class OneShotConfig(PredictorConfig):
     """Settings of the direct (non-autoregressive) trajectory predictor."""
 
     training = TrainConfig(epochs=150, learning_rate=4e-3)
+    added = (*PredictorConfig.added, "error_weighting")
 
     features: str = "outline"
     """Features of the object that the predictor is given: outline alone fits."""
@@ -95,6 +98,9 @@ class OneShotConfig(PredictorConfig):
     """Whether every lever-up is also seen in the mirror."""
     outcomes: tuple[str, ...] = ("levered",)
     """Outcomes that it distinguishes; each has a future of its own."""
+    error_weighting: float = 0.0
+    """How little motions count in the loss that can hardly be predicted: each by the inverse of its predicted error
+    scale to this power. 0: all the same; 1: as in the likelihood of a Laplace distribution."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,6 +109,7 @@ class OneShotConfig(PredictorConfig):
             check_count(name, getattr(self, name), most)
         check_choice("pivot_edges", self.pivot_edges, (1, 2))
         check_flag("mirrored", self.mirrored)
+        check_ranges(TrainingError, "predictor", self, {"error_weighting": (0.0, 1.0)}, "give a power")
         check_outcomes(self.outcomes)
         object.__setattr__(self, "outcomes", tuple(self.outcomes))
 
@@ -267,7 +274,13 @@ class OneShotPredictor(EffectPredictor):
         compared = valid.any(dim=-1).float()[
             :, None
         ]  # of a short trajectory there may be no sample among them
-        loss = SCALE_WEIGHT * scale_loss - TEMPERATURE / scale * likelihood.logsumexp(dim=-1)
+        motion_loss = -TEMPERATURE / scale * likelihood.logsumexp(dim=-1)
+        if self.config.error_weighting:
+            # Seitzer et al., 2022, with the error scale that futures of this outcome are expected to have.
+            known = (share * expected.detach().clamp(min=LEAST_WEIGHTED)).sum(dim=-1)
+            counts = torch.exp(-self.config.error_weighting * known)
+            motion_loss = motion_loss * counts / counts.mean(dim=1, keepdim=True)
+        loss = SCALE_WEIGHT * scale_loss + motion_loss
         return (loss * compared).mean() / compared.mean().clamp(min=1e-6)
 
     def finish(
