@@ -22,7 +22,7 @@ from foretrace.objects import sample_prism
 from foretrace.predictor import OneShotConfig, OneShotPredictor, one_shot
 from foretrace.predictor.mixture import along_edges
 from foretrace.predictor.parts import effects_of, features_of, prepare
-from foretrace.predictor.states import encode_states
+from foretrace.predictor.states import Effects, encode_states
 from foretrace.predictor.training import TrainConfig, fit_predictor, train_predictor
 from foretrace.trajectories import mean_distance, rotation_error
 
@@ -184,6 +184,64 @@ def test_an_interrupted_training_ends_with_the_same_model(batch, tmp_path, monke
     monkeypatch.undo()
     cut = train_predictor(batch, CONFIG, tmp_path / "cut", QUICK, split=everything(batch), progress=False)
     assert (cut / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+
+
+def conditioned(hidden_share):
+    torch.manual_seed(0)
+    config = replace(CONFIG, context=("friction", "contact_error"), hidden_share=hidden_share)
+    predictor = config.make(24)
+    predictor.state_mean.copy_(torch.linspace(-0.2, 0.3, 6))
+    predictor.state_scale.copy_(torch.linspace(0.5, 1.5, 6))
+    return predictor
+
+
+def moved_effects(predictor, execution):
+    """Objects with corners at the executed contact and a centimetre ahead of it, where their positions are, too."""
+    rows, turn = len(execution), execution[:, 2]
+    ahead = torch.stack([turn.cos(), turn.sin(), 0 * turn], dim=1)
+    contact = torch.cat([execution[:, :2], torch.full((rows, 1), 0.02)], dim=1)
+    corners = torch.stack([contact, contact + 0.01 * ahead] * (MAX_CORNERS // 2), dim=1)[..., :2]
+    states = torch.cat(
+        [torch.stack([contact, contact + 0.01 * ahead], dim=1), torch.stack([0 * ahead, ahead], 1)], -1
+    )
+    states = (states - predictor.state_mean) / predictor.state_scale
+    features = (corners / UNIT).flatten(1)
+    lengths, outcomes = torch.full((rows,), 2), torch.zeros(rows, dtype=torch.long)
+    context = np.column_stack([np.full(rows, 0.8), np.where(execution.any(dim=1), np.nan, 0.0)])
+    return predictor.add_context(features, context), Effects(
+        states, lengths, outcomes, torch.zeros(rows, 3), execution
+    )
+
+
+def test_actions_executed_elsewhere_are_learned_from_as_exact_ones():
+    predictor = conditioned(1e-9)
+    execution = torch.tensor([[0.002, -0.001, 0.05], [0.0, 0.0, 0.0], [-0.003, 0.003, -0.04]])
+    features, effects = predictor.augment(*moved_effects(predictor, execution))
+    assert (features[:, -2:] == 1).all()  # told
+    corners = predictor._corners(features)
+    torch.testing.assert_close(
+        corners[:, :2], torch.tensor([[[0.0, 0.0], [0.01, 0.0]]] * 3), atol=1e-7, rtol=0
+    )
+    states = effects.states * predictor.state_scale + predictor.state_mean
+    there = torch.tensor([[0.0, 0.0, 0.02, 0.0, 0.0, 0.0], [0.01, 0.0, 0.02, 1.0, 0.0, 0.0]])
+    torch.testing.assert_close(states, there.expand(3, 2, 6), atol=1e-6, rtol=0)
+
+
+def test_where_the_contact_is_hidden_half_the_actions_are_commanded_elsewhere():
+    predictor = conditioned(1.0)
+    inputs, before = moved_effects(predictor, torch.zeros(4000, 3))
+    inputs[:100, -1] = 0.0  # recorded, and not known to be exact
+    features, effects = predictor.augment(inputs, before)
+    contact = predictor._corners(features)[:, 0]
+    moved = (contact != 0).any(dim=1)
+    hidden = features[:, -1] == 0
+    assert not moved[:100].any()
+    assert not moved[~hidden].any()
+    assert 0.45 < moved[100:][hidden[100:]].float().mean() < 0.55
+    assert 0.0029 < contact.abs().max() <= 0.003
+    there = (effects.states * predictor.state_scale + predictor.state_mean)[:, 0, :2]
+    torch.testing.assert_close(there, contact, atol=1e-6, rtol=0)
+    assert (before.states == moved_effects(predictor, torch.zeros(4000, 3))[1].states).all()
 
 
 def test_motions_that_can_hardly_be_predicted_count_less(batch, monkeypatch):

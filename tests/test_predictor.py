@@ -161,7 +161,9 @@ def test_oracles_do_not_imagine_from_a_view(batch, registered):
 
 def effects(states: torch.Tensor, lengths: torch.Tensor) -> Effects:
     com = torch.full((len(states), 3), torch.nan)
-    return Effects(states, lengths, torch.zeros(len(states), dtype=torch.long), com)
+    return Effects(
+        states, lengths, torch.zeros(len(states), dtype=torch.long), com, torch.zeros(len(states), 3)
+    )
 
 
 @pytest.mark.parametrize("window", [5, 23, 60])

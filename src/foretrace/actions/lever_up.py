@@ -95,6 +95,11 @@ class ToolPath:
             )
         return replace(self, insert_time=self.insert_time / speed, lift_time=self.lift_time / speed)
 
+    @classmethod
+    def phases(cls) -> tuple[float, float]:
+        """Start of the nominal path's push, and the time that it takes to push and lift, which speed shortens [s]."""
+        return cls.wait_time, NOMINAL_TIME
+
     def at(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3"]:
         """Blade tip over time.
 

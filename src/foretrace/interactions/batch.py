@@ -50,6 +50,9 @@ class InteractionBatch:
     """Observed support points in the action frame [m]; NaN where not observed."""
     outcome: np.ndarray
     """(batch,) array of outcome names (str)."""
+    execution: Float[np.ndarray, "batch 3"]
+    """The executed action relative to the commanded one: ahead and to the left [m], turned to the left [rad]; NaN where
+    that is not known."""
     parameters: dict[str, np.ndarray]
     """(batch,) arrays by name [SI]: physical constants as in `Physics`, and parameters of the actions; NaN where an
     interaction has no such one."""
@@ -166,6 +169,7 @@ class InteractionBatch:
             slip_index=np.zeros(n, dtype=np.int64),
             support_points=np.full((n, 2, 2), np.nan),
             outcome=outcome_array([""] * n),
+            execution=np.full((n, 3), np.nan),
             parameters={},
         )
 

@@ -44,7 +44,8 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
     corners = _corners_in_action(table, objects)
     slip_index = table["slip_index"].to_numpy()
     constants = {name: table[name].to_numpy().astype(float) for name in storage.PHYSICS_COLUMNS}
-    constants["contact_error"] = _contact_errors(table)
+    execution = _execution(table)
+    constants["contact_error"] = np.hypot(execution[:, 0], execution[:, 1])
     constants["com_offset"] = _com_offsets(table, objects)
     return InteractionBatch(
         ids=table["id"].to_numpy(),
@@ -60,15 +61,16 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
         slip_index=np.where(np.isnan(slip_index.astype(float)), length, slip_index).astype(np.int64),
         support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
         outcome=outcome_array(table["outcome"].to_pylist()),
+        execution=execution,
         parameters=constants | parameter_values(table),
     )
 
 
-def _contact_errors(table: pa.Table) -> Float[np.ndarray, " batch"]:
-    """Distances of executed contacts from commanded ones [m]; NaN for recordings, where they were not measured."""
-    ahead, left = (table[storage.EXECUTION + name].to_numpy().astype(float) for name in ("ahead", "left"))
+def _execution(table: pa.Table) -> Float[np.ndarray, "batch 3"]:
+    """Executed actions relative to the commanded ones; NaN for recordings, where that was not measured."""
+    columns = [table[storage.EXECUTION + name].to_numpy().astype(float) for name in ("ahead", "left", "turn")]
     simulated = np.array([source == "simulated" for source in table["source"].to_pylist()], dtype=bool)
-    return np.where(simulated, np.hypot(ahead, left), np.nan)
+    return np.where(simulated[:, None], np.column_stack(columns), np.nan)
 
 
 def _com_offsets(table: pa.Table, objects: Mapping[str, ObjectModel]) -> Float[np.ndarray, " batch"]:

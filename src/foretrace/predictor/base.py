@@ -377,6 +377,17 @@ class EffectPredictor(Imaginer, nn.Module):
         hidden = (chance < self.config.hidden_share / 2) | (some & (chance < self.config.hidden_share))
         return self.without_context(inputs, hidden)
 
+    def augment(
+        self, inputs: Float[Tensor, "batch inputs"], effects: Effects
+    ) -> tuple[Float[Tensor, "batch inputs"], Effects]:
+        """What one training step learns from: by default the interactions with some constants hidden.
+
+        Args:
+            inputs: Features and context, as from `add_context`.
+            effects: The effects.
+        """
+        return self.hide_context(inputs), effects
+
     @final
     def without_context(
         self, inputs: Float[Tensor, "batch inputs"], hidden: Bool[Tensor, "batch optional"]

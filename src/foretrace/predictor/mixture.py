@@ -7,6 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from foretrace.predictor.phase_time import Warp
+
 COORDINATES = 6
 """Numbers of a motion per sample: displacement of the centre of mass, rotation vector, along an edge's axes [m]."""
 TURN_LENGTH = 0.05
@@ -35,6 +37,8 @@ class Mixture:
     """PCA basis of trajectories along an edge's axes [m]; turns times ``TURN_LENGTH``."""
     mean_motion: Float[Tensor, "time 6"]
     """Mean trajectory, which they are added to."""
+    warp: Warp | None = None
+    """Where the trajectories' samples lie in those of the basis, the same for all or for each; None: they are those."""
 
     def most_probable(self) -> Float[Tensor, "batch time 6"]:
         """Positions [m] and rotation vectors [rad] of the most probable future of each."""
@@ -66,8 +70,11 @@ class Mixture:
         """Root mean square of the distance from each future's positions [m]."""
         displaced = self.components[..., :3].permute(1, 2, 0).flatten(0, 1)  # (time 3, components)
         variance = ((displaced @ self.covariance) * displaced).sum(dim=-1)
-        at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()  # (outcomes, time)
-        return (self.error[..., None] * at_error_1).flatten(1, 2)
+        at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()[None]  # (1, outcomes, time)
+        if self.warp is not None:
+            rows = len(self.warp.before)
+            at_error_1 = self.warp.read(at_error_1[..., None].expand(rows, -1, -1, 1))[..., 0]
+        return (self.error[..., None] * at_error_1[:, None]).flatten(1, 2)
 
     def _states(
         self,
@@ -75,16 +82,18 @@ class Mixture:
         axes: Float[Tensor, "batch edges 3 3"],
     ) -> Float[Tensor, "batch edges*futures time 6"]:
         shape = (*weights.shape[:3], 2, 3)  # displacements and turns
-        motion = torch.addmm(
-            self.mean_motion.mT.flatten(), weights.flatten(0, 2), self.components.mT.flatten(1)
-        )
+        components, mean, warp = self.components, self.mean_motion, self.warp
+        if warp is not None and len(warp.before) == 1:  # the same for all: the basis is read once
+            components, mean, warp = warp.read(components[None])[0], warp.read(mean[None])[0], None
+        motion = torch.addmm(mean.mT.flatten(), weights.flatten(0, 2), components.mT.flatten(1))
         back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)
         rest = F.pad(self.com, (0, 3)).unflatten(1, (2, 3))[:, None, None].expand(shape)
         # One product with time last: memory is gone through once, in long rows.
         states = torch.baddbmm(
             rest.flatten(0, 3)[..., None], back.flatten(0, 3), motion.unflatten(1, (2, 3, -1)).flatten(0, 1)
         )
-        return states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
+        states = states.unflatten(0, shape[:4]).flatten(1, 2).flatten(2, 3).mT
+        return states if warp is None else warp.read(states)
 
 
 def along_edges(

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from foretrace.errors import TrainingError, check_ranges
+from foretrace.actions import LeverUp
+from foretrace.errors import TrainingError, check_ranges, shown
 from foretrace.features import Outline, action_frame, pivot_edges
 from foretrace.features.outline import pixel_error
 from foretrace.features.pivot_edges import PROBES, PivotEdges
@@ -22,7 +23,8 @@ from foretrace.imagined import (
     conformal_scores,
     quantiles_of,
 )
-from foretrace.imagined.context import first_action
+from foretrace.imagined.belief import EXECUTION, RANGES
+from foretrace.imagined.context import EXACT, first_action
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.predictor.base import EffectPredictor
@@ -36,11 +38,14 @@ from foretrace.predictor.config import (
 )
 from foretrace.predictor.ensemble import MANY, Ensemble
 from foretrace.predictor.mixture import COORDINATES, TURN_LENGTH, Mixture, along_edges
+from foretrace.predictor.phase_time import Warp, in_phase, phase_of
 from foretrace.predictor.states import Effects, decode_poses
 from foretrace.predictor.temperature import Odds, fit_temperatures, tempered
 from foretrace.predictor.traced import TracedDistribution
 from foretrace.predictor.trajectory_basis import find_basis, fit_covariance
 
+SPEED = "speed"
+"""Name of the parameter of a lever-up's path that phases depend on."""
 TURN_WEIGHT = 0.5
 """Weight of the turn in the loss, beside 1 for the displacement."""
 TEMPERATURE = 0.003
@@ -55,6 +60,8 @@ SMALLEST_ERROR = -15.0
 """Logarithm of the smallest error scale that is learned: below, its likelihood would overflow for an odd lever-up."""
 LEAST_WEIGHTED = -7.0
 """Logarithm of the error scale below which motions count no more than at it, see ``error_weighting``."""
+ELSEWHERE_SHARE = 0.5
+"""Share of actions that training takes as commanded elsewhere, among those of which the contact's error is hidden."""
 DISAGREEMENT = 8.0
 """Error scale per distance between the outputs of networks and mirror images.
 
@@ -80,7 +87,7 @@ class OneShotConfig(PredictorConfig):
     """Settings of the direct (non-autoregressive) trajectory predictor."""
 
     training = TrainConfig(epochs=150, learning_rate=4e-3)
-    added = (*PredictorConfig.added, "error_weighting")
+    added = (*PredictorConfig.added, "error_weighting", "phase_time")
 
     features: str = "outline"
     """Features of the object that the predictor is given: outline alone fits."""
@@ -102,6 +109,10 @@ class OneShotConfig(PredictorConfig):
     """How little motions count in the loss that can hardly be predicted: each by the inverse of its predicted error
     scale to this power. 0: all the same; 1: as in the likelihood of a Laplace distribution."""
 
+    phase_time: bool = False
+    """Whether motions are compared at equal phases of the tool's path, not at equal times: for lever-ups, with their
+    speed in the context."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         limits = {"hidden": 4096, "layers": 32, "ensemble": 100, "components": 1024}
@@ -112,6 +123,12 @@ class OneShotConfig(PredictorConfig):
         check_ranges(TrainingError, "predictor", self, {"error_weighting": (0.0, 1.0)}, "give a power")
         check_outcomes(self.outcomes)
         object.__setattr__(self, "outcomes", tuple(self.outcomes))
+        check_flag("phase_time", self.phase_time)
+        if self.phase_time and (SPEED not in self.context or first_action(self.outcomes) is not LeverUp):
+            raise TrainingError(
+                f"phase_time is True, the context is {shown(self.context)}: leave it out, or learn from lever-ups, "
+                f"conditioned on their {SPEED}"
+            )
 
 
 class Frames(NamedTuple):
@@ -174,6 +191,7 @@ class OneShotPredictor(EffectPredictor):
     quantiles: Tensor
     temperature: Tensor
     start_error: Tensor
+    slots: Tensor
 
     def __init__(self, config: OneShotConfig, num_samples: int):
         super().__init__(config, num_samples, "turn", config.outcomes)
@@ -201,6 +219,10 @@ class OneShotPredictor(EffectPredictor):
         # For a start that is observed or estimated, and for a context that is told or not.
         self.register_buffer("quantiles", torch.ones(len(STARTS), 2, len(LEVELS)))
         self.register_buffer("temperature", torch.ones(2))  # of outcomes, and of edges given the outcome
+        if config.phase_time:
+            self.register_buffer(
+                "slots", torch.zeros(num_samples)
+            )  # phases at which motions are predicted [s]
         # Of centres of mass at rest, beside that from the size of pixels [m].
         self.register_buffer("start_error", torch.zeros(len(STARTS)))
 
@@ -228,7 +250,11 @@ class OneShotPredictor(EffectPredictor):
 
         A shorter trajectory counts as if it stayed where it ends.
         """
+        if self.config.phase_time:
+            ends = phase_of((effects.lengths - 1) * self._period, self._speed(features))
+            self.slots.copy_(torch.linspace(0, float(ends.max()), len(self.slots)))
         features, effects = _some(features, effects)
+        effects = self._in_phase(features, effects)
         edges = self._find_edges(features, self._com(effects.states))
         values = edges.values.flatten(0, 2)
         moved = along_edges(edges.axes[:, 0, 0], self._motion(self._held(effects)))  # (batch, time, 6)
@@ -241,6 +267,38 @@ class OneShotPredictor(EffectPredictor):
         self.motions[: len(components)] = components
         self.parity[: len(parity)] = parity
 
+    def augment(
+        self, inputs: Float[Tensor, "batch inputs"], effects: Effects
+    ) -> tuple[Float[Tensor, "batch inputs"], Effects]:
+        """As of all predictors; where the contact's error may be told or not, actions are seen from other contacts.
+
+        An action that was executed elsewhere than commanded is an exact one, seen from there. An exact one of which
+        that is not told may have been commanded elsewhere, as far away as a `Belief` holds possible.
+        """
+        names = [self.context[column] for column in self.optional]
+        if EXACT not in names:
+            return super().augment(inputs, effects)
+        flag = inputs.shape[1] - len(names) + names.index(EXACT)
+        known = (inputs[:, flag] > 0) | (effects.execution != 0).any(dim=1)
+        inputs = inputs.clone()
+        inputs[:, flag] = known.float()
+        inputs = self.hide_context(inputs)
+        low, high = inputs.new_tensor([RANGES[name] for name in EXECUTION]).T
+        rows = len(inputs)
+        hidden = known & (inputs[:, flag] == 0)
+        elsewhere = hidden & (torch.rand(rows, device=self.device) < ELSEWHERE_SHARE)
+        commanded = (low + (high - low) * torch.rand(rows, 3, device=self.device)) * elsewhere[:, None]
+        turn = commanded[:, 2] - effects.execution[:, 2]
+        c, s = turn.cos(), turn.sin()
+        rotation = torch.stack([torch.stack([c, -s], dim=1), torch.stack([s, c], dim=1)], dim=1)
+        shift = commanded[:, None, :2] - effects.execution[:, None, :2] @ rotation.mT
+        corners = self._corners(inputs) @ rotation.mT + shift
+        inputs[:, : 2 * MAX_CORNERS] = corners.flatten(1) / UNIT
+        states = effects.states * self.state_scale + self.state_mean
+        states[..., :2] = states[..., :2] @ rotation.mT + shift
+        states[..., 3:5] = states[..., 3:5] @ rotation.mT
+        return inputs, replace(effects, states=(states - self.state_mean) / self.state_scale)
+
     def training_loss(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Float[Tensor, ""]:
         """Negative log-likelihood of the observed motions, in units of the normalised position.
 
@@ -248,7 +306,7 @@ class OneShotPredictor(EffectPredictor):
         and is summed over pivot edges. Distances, not their squares: one lever-up that goes another way does not
         outweigh all others.
         """
-        scale = self.state_scale[0]
+        scale, effects = self.state_scale[0], self._in_phase(features, effects)
         edges = self._find_edges(features, self._com(effects.states))
         outputs = self._outputs(features, edges)
         time = torch.randperm(effects.states.shape[1], device=self.device)[:SAMPLES_PER_STEP]
@@ -333,7 +391,10 @@ class OneShotPredictor(EffectPredictor):
 
     def _odds(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Odds:
         """Predicted log-probabilities, and what happened."""
-        mixture = self.mixture(features, self._com(effects.states))
+        mixture, effects = (
+            self.mixture(features, self._com(effects.states)),
+            self._in_phase(features, effects),
+        )
         rows = torch.arange(len(effects), device=self.device)
         weights = mixture.mean[rows, :, effects.outcomes]
         truth = along_edges(mixture.axes, self._motion(self._held(effects))).flatten(2)
@@ -442,6 +503,7 @@ class OneShotPredictor(EffectPredictor):
             covariance=self.covariance,
             components=self.motions,
             mean_motion=self.mean_motion,
+            warp=self._warp(features),
         )
 
     def _quantiles_of(
@@ -479,6 +541,7 @@ class OneShotPredictor(EffectPredictor):
     ) -> Float[Tensor, "batch components"]:
         """Normalised residuals: errors of the weights over the predicted error scale, at the better pivot edge."""
         mixture = self.mixture(features, self._com(effects.states))
+        effects = self._in_phase(features, effects)
         truth = along_edges(mixture.axes, self._motion(self._held(effects))).flatten(2)
         rows = torch.arange(len(effects), device=self.device)
         mean = mixture.mean[rows, :, effects.outcomes]  # (batch, edges, components)
@@ -487,6 +550,34 @@ class OneShotPredictor(EffectPredictor):
         better = off.square().sum(dim=2).argmin(dim=1)
         weights = off[rows, better] @ basis.mT / basis.square().sum(dim=1).clamp(min=1e-12)
         return weights / mixture.error[rows, better, effects.outcomes][:, None]
+
+    # --- phases of the path -------------------------------------------------------------------------------
+
+    @property
+    def _period(self) -> Tensor:
+        """Time between samples [s]."""
+        return self.times[1] - self.times[0]
+
+    def _speed(self, features: Float[Tensor, "batch inputs"]) -> Float[Tensor, " batch"]:
+        """Speeds of the actions' paths, as multiples of the nominal one."""
+        k = self.context.index(SPEED)
+        return features[:, self.features.num_features + k] * self.known_scale[k] + self.known_mean[k]
+
+    def _in_phase(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> Effects:
+        """Effects as they are compared with the basis."""
+        if not self.config.phase_time:
+            return effects
+        return in_phase(effects, self._speed(features), self.slots, self._period)
+
+    def _warp(self, features: Float[Tensor, "batch inputs"]) -> Warp | None:
+        """Where samples of trajectories lie in the basis."""
+        if not self.config.phase_time:
+            return None
+        speed = self._speed(features)
+        if not torch.compiler.is_compiling() and len(speed) > 1 and bool((speed == speed[0]).all()):
+            speed = speed[:1]
+        wanted = phase_of(self.times, speed[:, None])
+        return Warp.to(wanted, self.slots[1] - self.slots[0], len(self.slots))
 
     # --- from states to motions ---------------------------------------------------------------------------
 

@@ -43,6 +43,8 @@ class Part:
     """(batch,) numbers of the outcomes that the predictor distinguishes."""
     estimated_com: np.ndarray
     """(batch, 3) centres of mass at rest as estimated from the views [m]; NaN of weighted objects."""
+    execution: np.ndarray
+    """(batch, 3) executed actions relative to the commanded ones [m, m, rad]; zeros where that is not known."""
     measures: dict[str, np.ndarray]
     """(batch,) measures by which objects are compared."""
     features: Tensor | None = field(default=None, init=False)
@@ -81,6 +83,7 @@ def prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = 
         lengths=predictor.lengths(source),
         outcomes=predictor.number_outcomes(source),
         estimated_com=_estimated_com(source),
+        execution=np.nan_to_num(source.execution),
         measures=measure(source, source.com[:, 0]) | predictor.features.measure(inputs),
     )
 
@@ -108,8 +111,11 @@ def effects_of(part: Part, predictor: EffectPredictor, in_place: bool = False) -
     else:
         states = predictor.normalise(part.states) * valid.to(predictor.device)[..., None]
     lengths, outcomes = (torch.from_numpy(n).to(predictor.device) for n in (part.lengths, part.outcomes))
-    estimated = torch.as_tensor(part.estimated_com, dtype=torch.float32, device=predictor.device)
-    return Effects(states, lengths, outcomes, estimated)
+    estimated, execution = (
+        torch.as_tensor(n, dtype=torch.float32, device=predictor.device)
+        for n in (part.estimated_com, part.execution)
+    )
+    return Effects(states, lengths, outcomes, estimated, execution)
 
 
 def _estimated_com(source: InteractionBatch) -> np.ndarray:
@@ -131,6 +137,7 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
             "lengths": piece.lengths,
             "outcomes": piece.outcomes,
             "estimated_com": piece.estimated_com,
+            "execution": piece.execution,
         }
         for whole, found in ((columns, own), (measures, piece.measures)):
             for name, values in found.items():

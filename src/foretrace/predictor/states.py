@@ -1,6 +1,6 @@
 """The state of a predictor, and the way from recorded trajectories to states and back."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -47,12 +47,15 @@ class Effects:
     """Number of each one's outcome among those that the predictor distinguishes."""
     estimated_com: Float[Tensor, "batch 3"]
     """Centres of mass at rest as estimated from the views [m]; NaN: not to be estimated, the object is weighted."""
+    execution: Float[Tensor, "batch 3"]
+    """Executed actions relative to the commanded ones: ahead and to the left [m], turned to the left [rad]; zeros where
+    that is not known."""
 
     def __len__(self) -> int:
         return len(self.states)
 
     def __getitem__(self, rows: Tensor) -> "Effects":
-        return Effects(self.states[rows], self.lengths[rows], self.outcomes[rows], self.estimated_com[rows])
+        return Effects(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
 def state_size(kind: StateKind) -> int:

@@ -306,7 +306,7 @@ class _Training:
                     features = predictor.add_context(features, self.train.context[rows.numpy()])
                 else:
                     features = fixed[rows]
-                loss = predictor.training_loss(predictor.hide_context(features), self.effects[rows])
+                loss = predictor.training_loss(*predictor.augment(features, self.effects[rows]))
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
