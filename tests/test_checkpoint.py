@@ -170,14 +170,14 @@ def test_files_of_version_1_are_read(tmp_path, batch):
     config = content.pop("config")
     features = {"label": config.pop("features"), "options": config.pop("feature_options")}
     names = {"ensemble": "members", "components": "motions", "pivot_edges": "hinges"}
-    later = ("context", "hidden_share", "error_weighting")
+    later = ("context", "hidden_share", "error_weighting", "phase_time")
     settings = {names.get(name, name): value for name, value in config.items() if name not in later}
     training = content["training"] | {"state": "position", "window": 15}
     del content["outcomes"]
     old = content | {"version": 1, "settings": settings, "features": features, "training": training}
     (tmp_path / "config.json").write_text(json.dumps(old))
     expected = read_config(shipped)
-    assert [expected["config"].pop(name) for name in later[1:]] == [0.0, 0.0]
+    assert [expected["config"].pop(name) for name in later[1:]] == [0.0, 0.0, False]
     assert read_config(tmp_path) == expected
     found, expected = (load_predictor(path).imagine_batch(batch, "estimated") for path in (tmp_path, shipped))
     np.testing.assert_array_equal(found.com, expected.com)

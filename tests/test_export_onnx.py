@@ -51,8 +51,8 @@ def shake(predictor, seed: int = 0):
             state[name] = 0.1 + noise.abs()
         elif name == "parity":
             state[name] = noise.sign()
-        elif name == "times":
-            state[name] = 0.05 * torch.arange(len(tensor)).to(tensor)
+        elif name in ("times", "slots"):
+            state[name] = (0.05 if name == "times" else 0.04) * torch.arange(len(tensor)).to(tensor)
         else:
             state[name] = (
                 tensor + (0.01 if name.endswith("motions") or name == "mean_motion" else 0.2) * noise
@@ -64,8 +64,8 @@ def shake(predictor, seed: int = 0):
 def one_shot() -> OneShotPredictor:
     torch.manual_seed(0)
     config = OneShotConfig(
-        feature_options={"heights": True}, context=("friction", "density"), hidden_share=0.5, hidden=8, layers=2,
-        ensemble=2, components=4, outcomes=("levered", "slipped"),
+        feature_options={"heights": True}, context=("friction", "density", "speed"), hidden_share=0.5, hidden=8,
+        layers=2, ensemble=2, components=4, outcomes=("levered", "slipped"), phase_time=True,
     )  # fmt: skip
     return shake(OneShotPredictor(config, SAMPLES))
 
@@ -102,7 +102,8 @@ def test_a_distribution_is_that_of_the_predictor(command, views):
     names = [output.name for output in session.get_outputs()]
     for rows in (slice(0, 1), slice(1, 4), slice(0, 6)):
         features, com = predictor.features.inputs(views[rows]), estimate_com(views[rows])
-        context = np.full((len(com), 2), [0.5, np.nan], np.float32)  # the density is not told
+        context = np.full((len(com), 3), [0.5, np.nan, 1.1], np.float32)  # the density is not told
+        context[1:, 2] = np.linspace(0.7, 1.4, len(com) - 1)
         inputs = {"features": features.numpy(), "com": com.astype(np.float32), "context": context}
         said = dict(zip(names, session.run(None, inputs), strict=True))
         futures = predictor.imagine_effects(predictor.add_context(features, context), com).futures

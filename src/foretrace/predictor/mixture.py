@@ -72,7 +72,7 @@ class Mixture:
         variance = ((displaced @ self.covariance) * displaced).sum(dim=-1)
         at_error_1 = variance.unflatten(-1, (-1, 3)).sum(dim=-1).sqrt()[None]  # (1, outcomes, time)
         if self.warp is not None:
-            rows = len(self.warp.before)
+            rows = self.warp.before.shape[0]
             at_error_1 = self.warp.read(at_error_1[..., None].expand(rows, -1, -1, 1))[..., 0]
         return (self.error[..., None] * at_error_1[:, None]).flatten(1, 2)
 
@@ -83,7 +83,7 @@ class Mixture:
     ) -> Float[Tensor, "batch edges*futures time 6"]:
         shape = (*weights.shape[:3], 2, 3)  # displacements and turns
         components, mean, warp = self.components, self.mean_motion, self.warp
-        if warp is not None and len(warp.before) == 1:  # the same for all: the basis is read once
+        if warp is not None and warp.before.shape[0] == 1:  # the same for all: the basis is read once
             components, mean, warp = warp.read(components[None])[0], warp.read(mean[None])[0], None
         motion = torch.addmm(mean.mT.flatten(), weights.flatten(0, 2), components.mT.flatten(1))
         back = torch.stack([axes, axes / TURN_LENGTH], dim=2).mT[:, :, None].expand(*shape, 3)

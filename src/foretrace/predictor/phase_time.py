@@ -47,8 +47,8 @@ class Warp:
         """Samples, second to last axis, at the wanted times."""
         extra = (1,) * (samples.dim() - 3)
         shape = (*samples.shape[:-2], self.before.shape[1], samples.shape[-1])
-        rows = self.before.view(len(self.before), *extra, -1, 1).expand(shape)
-        share = self.share.view(len(self.share), *extra, -1, 1)
+        rows = self.before.view(self.before.shape[0], *extra, -1, 1).expand(shape)
+        share = self.share.view(self.share.shape[0], *extra, -1, 1)
         last = samples.shape[-2] - 1
         low, high = samples.gather(-2, rows), samples.gather(-2, (rows + 1).clamp(max=last))
         return low + share * (high - low)
