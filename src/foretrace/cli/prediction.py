@@ -17,7 +17,7 @@ from foretrace.cli.futures import say_futures
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
-from foretrace.imagined.context import CONSTANTS, EXACT, context_units, nominal_constants
+from foretrace.imagined.context import EXACT, context_units, nominal_constants
 from foretrace.imagined.shown import LEVEL, radius_of
 from foretrace.perception.example import EXAMPLE
 from foretrace.perception.photo import PhotoConfig
@@ -217,10 +217,10 @@ def _told(given: dict[str, float], context: tuple[str, ...], unknown: bool) -> d
 
 
 def _simulate(obj: "ObjectModel", action: "Action", given: dict[str, float]) -> "Interaction":
-    from foretrace.interactions.record import Physics
+    from foretrace.interactions.record import PHYSICS_RANGES, Physics
     from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 
-    physics = Physics(**{name: value for name, value in given.items() if name in CONSTANTS})
+    physics = Physics(**{name: value for name, value in given.items() if name in PHYSICS_RANGES})
     return simulate_lever_up(obj, action, SimulationConfig(physics=physics))
 
 

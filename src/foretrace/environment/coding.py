@@ -45,7 +45,7 @@ def observed_context(observation: dict[str, np.ndarray]) -> dict[str, float]:
     """The physical constants in an observation [SI], as imaginers are told them."""
     told = observation["context"].astype(float)
     values = {name: float(value) * nominal_constants()[name] for name, value in zip(TOLD, told, strict=True)}
-    return {**values, "contact_error": 0.0}
+    return {**nominal_constants(), **values}
 
 
 def decode_action(outline: Float[np.ndarray, "corners 2"], values: Float[np.ndarray, " action"]) -> LeverUp:

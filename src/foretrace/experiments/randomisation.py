@@ -44,7 +44,7 @@ from foretrace.experiments.training import BASE, Recipe, load_levered
 from foretrace.experiments.transfer import distance_until_slip
 from foretrace.experiments.transfer_objects import Subject, everyday_objects, play, printed_shapes
 from foretrace.features import FEATURES
-from foretrace.imagined.context import CONSTANTS, EXACT, check_names, column_of, true_context
+from foretrace.imagined.context import BEVELS, CONSTANTS, EXACT, check_names, column_of, true_context
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import Split, split_by_object
@@ -52,9 +52,11 @@ from foretrace.predictor import EffectPredictor
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.simulation.stand_in import Observation, StandIn, hull_of
 
-CONTEXT = (*CONSTANTS, *LeverUp.units)
+CONTEXT = (*(name for name in CONSTANTS if name not in BEVELS), *LeverUp.units)
 """Everything that may vary."""
-NAMES = tuple(name for name in CONSTANTS if name != EXACT)  # which is not known where it varies
+NAMES = tuple(
+    name for name in CONSTANTS if name not in (EXACT, *BEVELS)
+)  # which is not known where it varies
 """What predictors are conditioned on by default."""
 GROUPS = ("printed", "everyday")
 """Objects of the stand-in."""

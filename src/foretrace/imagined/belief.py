@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import PredictionError, check_type, is_number, is_whole, shown
-from foretrace.interactions.record import PHYSICS_RANGES
+from foretrace.imagined.context import RANGES as LIMITS
+from foretrace.objects import BEVEL
 
 RANGES: Mapping[str, tuple[float, float]] = {
     "friction": (0.5, 1.1),
@@ -16,12 +17,15 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "density": (300.0, 1200.0),
     "com_x": (0.0, 0.0),
     "com_y": (0.0, 0.0),
+    "bevel_width": (BEVEL.width, BEVEL.width),
+    "bevel_height": (BEVEL.height, BEVEL.height),
     "contact_ahead": (-0.003, 0.003),
     "contact_left": (-0.003, 0.003),
     "contact_turn": (-float(np.deg2rad(3.0)), float(np.deg2rad(3.0))),
 }
 """Ranges of the default prior, those of randomised data sets [SI]. ``com_x`` and ``com_y``: distance of the centre of
-mass from where it was given or estimated, in the object frame. ``contact_...``: execution error (`ExecutionOffset`)."""
+mass from where it was given or estimated, in the object frame. ``bevel_...``: its bevel, by default the nominal one.
+``contact_...``: execution error (`ExecutionOffset`)."""
 EXECUTION = ("contact_ahead", "contact_left", "contact_turn")
 """What differs between executions on the same object."""
 COM = ("com_x", "com_y")
@@ -109,11 +113,16 @@ class Belief:
     @cached_property
     def learned(self) -> tuple[str, ...]:
         """Constants that observation has told something about; all others keep their prior."""
-        return tuple(name for name in self.names if self.std[name] < LEARNED * self.prior_std[name])
+        return tuple(name for name in self._open if self.std[name] < LEARNED * self.prior_std[name])
+
+    @property
+    def _open(self) -> list[str]:
+        """Constants that were not fixed from the beginning."""
+        return [name for name in self.names if self.ranges[name][0] < self.ranges[name][1]]
 
     def __repr__(self) -> str:
         words = [f"{name} {self.mean[name]:.3g} ± {self.std[name]:.2g}" for name in self.learned]
-        kept = [name for name in self.names if name not in self.learned and self.prior_std[name] > 0]
+        kept = [name for name in self._open if name not in self.learned]
         return f"Belief({', '.join(words) or 'nothing learned'}; prior: {', '.join(kept) or 'none'})"
 
     def sample(self, n: int, rng: np.random.Generator | None = None) -> dict[str, Float[np.ndarray, " n"]]:
@@ -173,7 +182,7 @@ def _range(name: object, pair: Any) -> tuple[float, float]:
     fits = isinstance(pair, tuple | list) and len(pair) == 2 and all(map(is_number, pair))
     if not fits or not -np.inf < pair[0] <= pair[1] < np.inf:
         raise PredictionError(f"{name} has the range {shown(pair)}: give a least and a greatest number")
-    low, high = PHYSICS_RANGES.get(str(name), (-np.inf, np.inf))
+    low, high = LIMITS.get(str(name), (-np.inf, np.inf))
     if not low <= pair[0] <= pair[1] <= high:
         raise PredictionError(f"{name} has the range {shown(pair)}: give numbers from {low:g} to {high:g}")
     return float(pair[0]), float(pair[1])

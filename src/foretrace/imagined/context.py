@@ -13,16 +13,24 @@ from foretrace.actions import ACTIONS, Action
 from foretrace.errors import PredictionError, TrainingError, is_number, shown
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import PHYSICS_RANGES, Physics
+from foretrace.objects import BEVEL
 
 CONSTANTS = {
     "friction": "of object and table",
     "tool_friction": "of object and blade",
     "density": "in kg/m^3",
     "contact_error": "in m: 0 where the contact is executed as commanded",
+    "bevel_width": "in m: how far the bottom face lies inside the outline",
+    "bevel_height": "in m: room for the blade under the rim",
 }
-"""Constants by name: those of `Physics`, and how far the executed contact may be from the commanded one."""
+"""Constants by name: those of `Physics`, how far the executed contact may be from the commanded one, and the object's
+`Bevel`, which a view from above does not show."""
+BEVELS = ("bevel_width", "bevel_height")
+"""Constants of the object itself."""
 EXACT = "contact_error"
 """The constant that is either 0 or not known."""
+RANGES = PHYSICS_RANGES | dict.fromkeys(BEVELS, (0.0, 0.1))
+"""Values that constants may have [SI]."""
 UNKNOWN = "unknown"
 """Context in which no constant is told."""
 Context = Mapping[str, float] | Literal["unknown"] | None
@@ -89,6 +97,8 @@ def parameters_of(actions: Sequence[Action]) -> dict[str, Float[np.ndarray, " n"
 
 def column_of(batch: InteractionBatch, name: str) -> Float[np.ndarray, " batch"]:
     """Recorded values of one constant or parameter."""
+    if name in BEVELS:
+        return batch.bevel[:, BEVELS.index(name)]
     return batch.parameters.get(name, np.full(len(batch), np.nan))
 
 
@@ -96,7 +106,13 @@ def true_context(
     physics: Physics, names: Sequence[str], parameters: Mapping[str, float] | None = None
 ) -> dict[str, float]:
     """True values of one interaction's context [SI] by the given names; those of the nominal path by default."""
-    values = asdict(physics) | {EXACT: 0.0} | dict(nominal_parameters() if parameters is None else parameters)
+    bevel = dict(zip(BEVELS, (BEVEL.width, BEVEL.height), strict=True))
+    values = (
+        asdict(physics)
+        | {EXACT: 0.0}
+        | bevel
+        | dict(nominal_parameters() if parameters is None else parameters)
+    )
     return {name: values[name] for name in names}
 
 
@@ -212,7 +228,7 @@ def _told(
             raise PredictionError(
                 f"context {name} is {shown(value)}: give a finite value {context_units().get(name, 'in m')}"
             )
-        low, high = PHYSICS_RANGES.get(name, (-np.inf, np.inf))
+        low, high = RANGES.get(name, (-np.inf, np.inf))
         if not low <= float(value) <= high:
             raise PredictionError(f"context {name} is {shown(value)}: give a value from {low:g} to {high:g}")
     if context.get(EXACT, 0) != 0:

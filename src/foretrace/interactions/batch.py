@@ -53,6 +53,8 @@ class InteractionBatch:
     execution: Float[np.ndarray, "batch 3"]
     """The executed action relative to the commanded one: ahead and to the left [m], turned to the left [rad]; NaN where
     that is not known."""
+    bevel: Float[np.ndarray, "batch 2"]
+    """Width and height of each object's bevel [m]; NaN where it has none or that is not known."""
     parameters: dict[str, np.ndarray]
     """(batch,) arrays by name [SI]: physical constants as in `Physics`, and parameters of the actions; NaN where an
     interaction has no such one."""
@@ -170,6 +172,7 @@ class InteractionBatch:
             support_points=np.full((n, 2, 2), np.nan),
             outcome=outcome_array([""] * n),
             execution=np.full((n, 3), np.nan),
+            bevel=np.full((n, 2), np.nan),
             parameters={},
         )
 

@@ -62,6 +62,7 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
         support_points=np.array(_lists(table, "support_points", 2)).reshape(-1, 2, 2),
         outcome=outcome_array(table["outcome"].to_pylist()),
         execution=execution,
+        bevel=np.array([_bevel(objects[each]) for each in table["object"].to_pylist()]).reshape(-1, 2),
         parameters=constants | parameter_values(table),
     )
 
@@ -71,6 +72,12 @@ def _execution(table: pa.Table) -> Float[np.ndarray, "batch 3"]:
     columns = [table[storage.EXECUTION + name].to_numpy().astype(float) for name in ("ahead", "left", "turn")]
     simulated = np.array([source == "simulated" for source in table["source"].to_pylist()], dtype=bool)
     return np.where(simulated[:, None], np.column_stack(columns), np.nan)
+
+
+def _bevel(obj: ObjectModel) -> tuple[float, float]:
+    """Width and height of an object's bevel [m]."""
+    own = getattr(obj.object if isinstance(obj, Weighted) else obj, "bevel", None)
+    return (np.nan, np.nan) if own is None else (own.width, own.height)
 
 
 def _com_offsets(table: pa.Table, objects: Mapping[str, ObjectModel]) -> Float[np.ndarray, " batch"]:

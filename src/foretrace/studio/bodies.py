@@ -21,7 +21,7 @@ Pose = Annotated[list[float], Field(min_length=7, max_length=7)]
 Matrix = Annotated[
     list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
 ]
-ConstantName = Literal["friction", "tool_friction", "density", "contact_error"]
+ConstantName = Literal["friction", "tool_friction", "density", "contact_error", "bevel_width", "bevel_height"]
 GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "slide-off"]
 MOST_SAMPLES = 1000
 """Samples in one request, at most."""

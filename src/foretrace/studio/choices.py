@@ -11,6 +11,7 @@ from foretrace.actions import ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import StudioError, check_choices, check_type, is_number, shown
 from foretrace.imagined.belief import RANGES
+from foretrace.imagined.context import BEVELS, EXACT, nominal_constants
 from foretrace.objects import Bevel, ObjectModel, Prism
 from foretrace.planning import goals
 from foretrace.studio.shapes import EXAMPLES, checked, example
@@ -102,7 +103,8 @@ class Choices:
     def context(self) -> dict[str, float]:
         """What an imaginer is told [SI]; what is unknown is left out."""
         told = {name: value for name in PHYSICS if (value := getattr(self, name)) is not None}
-        return told | ({"contact_error": 0.0} if self.exact else {})
+        own = {name: nominal_constants()[name] for name in BEVELS}
+        return told | own | ({EXACT: 0.0} if self.exact else {})
 
     @property
     def wanted(self) -> goals.Goal:

@@ -10,6 +10,7 @@ from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import (
     ActionError,
     PredictionError,
+    ShapeError,
     check_choices,
     check_ranges,
     check_type,
@@ -26,10 +27,10 @@ from foretrace.imagined import (
     conformal_scores,
     quantiles_of,
 )
-from foretrace.imagined.context import CONSTANTS
+from foretrace.imagined.context import BEVELS, CONSTANTS
 from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.record import Physics
-from foretrace.objects import ObjectModel, Weighted
+from foretrace.objects import BEVEL, Bevel, ObjectModel, Prism, Weighted
 from foretrace.simulation.randomisation import RANDOMISED, Randomisation
 from foretrace.twin.calibration import TwinCalibration, check_calibration
 from foretrace.twin.gather import SLOTS, gather
@@ -276,6 +277,10 @@ class TwinImaginer(Imaginer):
         values = dict(zip(self.context, scenes.context[row].tolist(), strict=True))
         told = {name for name, value in values.items() if np.isfinite(value)}
         physics = Physics(**{name: values[name] for name in told if name in Physics.__dataclass_fields__})
+        if self.object is not None or not isinstance(seen.model, Prism):  # it has its own bevel, or none
+            told |= {*BEVELS}
+        elif told >= {*BEVELS}:
+            seen = replace(seen, model=_bevelled(seen.model, *(values[name] for name in BEVELS)))
         model = self._weighted(seen, scenes.com[row], physics.density)
         world = World(model, seen.T_action_object, self._action(scenes, row, values), physics)
         unsure = [name for name in CONSTANTS if name not in told]
@@ -285,8 +290,9 @@ class TwinImaginer(Imaginer):
             told.add("thickness_factor")
         shares = draw_shares(self.config.worlds, self.config.seed)
         noise = 0.0 if self.object is not None else self.config.outline_noise
+        told |= {f"{name}_factor" for name in BEVELS if name in told}
         if self.object is not None:
-            told |= {"thickness_factor", "bevel_width_factor", "bevel_height_factor"}
+            told.add("thickness_factor")
         return [vary(world, tuple(told), self.config.ranges, noise, each) for each in shares]
 
     def _weighted(self, seen: SeenObject, com: Float[np.ndarray, "3"], density: float) -> ObjectModel:
@@ -319,3 +325,13 @@ class TwinImaginer(Imaginer):
 def _path(settings: dict[str, float]) -> ToolPath:
     """The nominal path with other parameters: bit for bit the nominal one where they are nominal."""
     return NOMINAL if settings == NOMINAL.parameters() else ToolPath.of(**settings)
+
+
+def _bevelled(model: Prism, width: float, height: float) -> Prism:
+    """A prism with another bevel; where the object bears no such one, and at the nominal one, with that which fits."""
+    if (width, height) == (BEVEL.width, BEVEL.height):
+        return model
+    try:
+        return Prism(model.corners, model.height, Bevel(width, height))
+    except ShapeError:
+        return model
