@@ -87,10 +87,11 @@ figures: setup
 # are calibrated on lever-ups of other objects.
 checkpoint: setup
 	$(BIN)/foretrace simulate --recipe all --randomise --exact-share 0.5 --vary-action --off-centre --camera grid \
-		--embodiment tool --objects 3200 --seed 3 --out data/default
+		--embodiment tool --objects 4000 --seed 3 --out data/default
 	$(BIN)/foretrace train --data data/default --predictor one-shot --heights --hidden 192 --components 64 --epochs 60 \
-		--context friction tool_friction density contact_error insertion arc_radius sweep speed --hidden-share 0.6 \
-		--outcomes levered slipped tumbled rolled missed --split 31000 1200 700 --threads 1 --out runs/default --card
+		--phase-time --error-weighting 0.5 --hidden-share 0.6 --context friction tool_friction density contact_error \
+		bevel_width bevel_height insertion arc_radius sweep speed \
+		--outcomes levered slipped tumbled rolled missed --split 39300 1200 700 --threads 1 --out runs/default --card
 	$(BIN)/foretrace simulate --recipe all --randomise --exact-share 0.5 --vary-action --off-centre --camera grid \
 		--embodiment tool --objects 300 --seed 4 --out data/calibration
 	$(BIN)/foretrace recalibrate --run runs/default --data data/calibration

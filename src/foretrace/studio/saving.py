@@ -7,7 +7,7 @@ from pprint import pformat
 from tempfile import TemporaryDirectory
 
 from foretrace.errors import StudioError
-from foretrace.interactions.record import Interaction
+from foretrace.interactions.record import PHYSICS_RANGES, Interaction
 from foretrace.objects import ObjectModel, Prism
 from foretrace.pictures.animation import scene_animation
 from foretrace.pictures.prediction import scene_of
@@ -98,5 +98,5 @@ def _goal_line(goal: Goal) -> str:
 
 
 def _physics(told: dict[str, float]) -> str:
-    values = ", ".join(f"{name}={value!r}" for name, value in told.items() if name != "contact_error")
+    values = ", ".join(f"{name}={value!r}" for name, value in told.items() if name in PHYSICS_RANGES)
     return f", physics=ft.Physics({values})" if values else ""
