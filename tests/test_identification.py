@@ -85,6 +85,16 @@ def test_the_contact_of_an_execution_to_come_may_be_off_by_as_much_as_before():
     assert np.ptp(worlds.values["contact_left"][:256]) > 0.98 * (high - low)
 
 
+def test_a_bevel_is_the_nominal_one_unless_it_is_given_a_range():
+    fixed, open_ = ft.Belief(), ft.Belief({"bevel_height": (0.002, 0.004)})
+    assert set(fixed.sample(50)["bevel_height"]) == {0.003}
+    assert np.ptp(open_.sample(50)["bevel_height"]) > 0.0015
+    assert "bevel_height" not in repr(fixed)
+    assert "bevel_height" in repr(open_)
+    note = Slider().imagine(VIEW, ACTION, context=open_).warnings
+    assert any("bevel_height make no difference" in line for line in note)
+
+
 def test_an_exact_imaginer_has_the_last_word():
     belief = ft.identify(VIEW, ACTION, observed(0.65, 0.0), imaginer=Slider(), exact=Slider())
     assert len(belief.values) == identification.BEST

@@ -16,7 +16,7 @@ from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.outline import count_contradictions, fit_outline
 from foretrace.interactions.record import ExecutionOffset, Interaction, Physics
 from foretrace.interactions.topdown import TopDownView
-from foretrace.objects import Box, Cylinder, ObjectModel, Prism, Weighted, sample_dented, sample_prism
+from foretrace.objects import Bevel, Box, Cylinder, ObjectModel, Prism, Weighted, sample_dented, sample_prism
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.randomisation import Randomisation
 from foretrace.trajectories import mean_distance
@@ -210,6 +210,28 @@ def test_path_and_constants_are_those_that_are_told():
     assert np.abs(by_action.com_trajectory[:count] - record.com[0]).max() < 0.002
     nominal = twin.imagine(interaction.view, OWN, context=told)
     assert np.abs(by_action.com_trajectory - nominal.com_trajectory).max() > 0.005
+
+
+def test_a_told_bevel_is_that_of_the_object():
+    sharp = Prism(PRISM.corners, PRISM.height, Bevel(0.009, 0.0024))
+    action = LeverUp.at_edge(sharp, 2, 0.4)
+    batch = InteractionBatch.from_interactions(
+        [lever(sharp), lever(PRISM), lever(Weighted(sharp, (0.01, 0.0)))]
+    )
+    np.testing.assert_allclose(batch.bevel, [[0.009, 0.0024], [0.009, 0.003], [0.009, 0.0024]])
+    twin, nominal = TwinImaginer(config=CONFIG), TOLD | {"bevel_width": 0.009, "bevel_height": 0.003}
+    view = TopDownView(batch.mask[0], batch.height[0])
+    alone = twin.imagine(view, action, context=nominal | {"bevel_height": 0.0024})
+    assert alone.futures.probability.max() == 1.0  # simulated once
+    off = mean_distance(twin.imagine_batch(batch).com, batch.com)
+    without = mean_distance(
+        twin.imagine_batch(replace(batch, bevel=np.full((3, 2), [0.009, 0.003]))).com, batch.com
+    )
+    assert off.max() < 0.5 * without[0]
+    spread = twin.imagine(view, action, context=TOLD).futures.spread
+    assert np.nanmax(spread) > 0.0005 > np.nanmax(alone.futures.spread)  # where it is not told, it varies
+    with pytest.raises(PredictionError, match=r"context bevel_width is 0\.5: give a value from 0 to 0\.1"):
+        twin.imagine(view, action, context=nominal | {"bevel_width": 0.5})
 
 
 def test_a_centre_of_mass_off_the_middle_is_taken_as_it_is():
