@@ -67,7 +67,8 @@ const View = (() => {
       const row = Math.floor(place / size / side), column = Math.floor((place % size) / side);
       if (filled) features[2 * maxCorners + row * cells + column] += share;
     });
-    const com = Prism.centreOfMass(object), known = { ...physics, ...path };
+    const com = Prism.centreOfMass(object), { width, height } = object.bevel;
+    const known = { ...physics, ...path, bevel_width: width, bevel_height: height };
     return {
       features,
       com: Float32Array.from([...frames(action).enter(com), com[2]]),
