@@ -194,7 +194,7 @@ def test_a_folder_for_a_hub_is_read_again(tmp_path: Path) -> None:
     assert files == {"README.md", "config.json", "model.safetensors"}
     card = (tmp_path / "hub/README.md").read_text(encoding="utf-8")
     assert card.startswith("---\nlibrary_name: foretrace\n")
-    assert "| Weights | 751,410 |" in card
+    assert "| Weights | 755,250 |" in card
     again = ft.EffectPredictor.from_pretrained(tmp_path / "hub")
     assert again.learned_from == predictor.learned_from
     assert again.ranges == predictor.ranges

@@ -335,6 +335,7 @@ FIXED = {
     "contact_turn": (0.0, 0.0),
 }
 TOLD = {"friction": 0.9, "tool_friction": 0.3, "density": 600.0, "contact_error": 0.0}
+TOLD |= {"bevel_width": 0.009, "bevel_height": 0.003}
 
 
 def test_a_belief_without_doubt_is_a_context(predictor):

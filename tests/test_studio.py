@@ -186,7 +186,8 @@ def test_the_session_imagines_what_the_library_does():
     session = Session(Choices(along=0.3, turn=0.1, friction=None, sweep=0.6))
     action, obj = session.action, session.choices.object
     com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
-    told = {"tool_friction": 0.3, "density": 600.0, "contact_error": 0.0}
+    bevel = {"bevel_width": 0.009, "bevel_height": 0.003}
+    told = bevel | {"tool_friction": 0.3, "density": 600.0, "contact_error": 0.0}
     direct = load_imaginer().imagine(ft.TopDownView.of(obj, action), action, context=told, com=com)
     np.testing.assert_array_equal(direct.com_trajectory, session.imagined.com_trajectory)
     assert np.isnan(session.imagined.context["friction"])
