@@ -14,11 +14,12 @@ from foretrace.cli.prediction import _given_context
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
 from foretrace.imagined import LEVELS
-from foretrace.imagined.context import context_units, nominal_parameters, true_context
+from foretrace.imagined.context import CONSTANTS, context_units, nominal_parameters, true_context
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
 from foretrace.interactions.topdown import TopDownView
+from foretrace.objects import Box, Cylinder
 from foretrace.predictor import LstmConfig, OneShotConfig, TrainConfig, load_predictor, train_predictor
 from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.run_folder import fingerprint
@@ -358,3 +359,27 @@ def test_training_hides_a_share(marginal):
     every = hidden.all(dim=1).float().mean()
     assert every == pytest.approx(0.35 + 0.35 / 8, abs=0.02)
     assert hidden.any(dim=1).float().mean() == pytest.approx(0.35 + 0.35 * 7 / 8, abs=0.02)
+
+
+def test_a_lying_cylinder_is_told_no_bevel():
+    predictor = load_predictor()
+    box, cylinder = Box(0.12, 0.06, 0.05), Cylinder(0.025, 0.12)
+    action = LeverUp((0.0, -0.03), (0.0, 1.0))
+    told = {"bevel_width": 0.009, "bevel_height": 0.003}
+    for obj, has in ((box, True), (cylinder, False)):
+        own = action if has else LeverUp((0.0, -0.025), (0.0, 1.0))
+        view = TopDownView.of(obj, own)
+        for context in (None, told):
+            assert np.isfinite(predictor.imagine(view, context=context).context["bevel_width"]) == has
+        together = predictor.imagine_candidates(TopDownView.of(obj, LeverUp((0, 0), (1, 0))), [own])
+        assert np.isfinite(together.context["bevel_height"][0]) == has
+        without = {
+            name: value for name, value in predictor.imagine(view).context.items() if name in CONSTANTS
+        }
+        without = {name: value for name, value in without.items() if name not in told}
+        same = predictor.imagine(view, context=without).com_trajectory
+        assert np.array_equal(same, predictor.imagine(view).com_trajectory) != has
+    rolled = predictor.imagine(
+        TopDownView.of(cylinder, LeverUp((0.0, -0.025), (0.0, 1.0)))
+    ).futures.outcomes()
+    assert rolled["rolled"][0] > 0.5

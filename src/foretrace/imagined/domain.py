@@ -300,10 +300,22 @@ def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
     return np.concatenate([points, level[:, None]], axis=-1)
 
 
+def level_tops(source: InteractionBatch | Candidates) -> Bool[np.ndarray, " batch"]:
+    """Whether the top of each object is level, as a prism's is and that of a lying cylinder is not."""
+    if isinstance(source, Candidates):
+        return np.full(len(source.actions), _is_level(source.view.mask, source.view.height))
+    return np.array([_is_level(*view) for view in zip(source.mask, source.height, strict=True)], dtype=bool)
+
+
+def _is_level(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> bool:
+    top = float(height.max())
+    return top - float(height[mask].min()) <= LEVEL_TOP * top
+
+
 def _centre_height(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> float:
     """Height of the centre of mass [m]: that of a prism with a bevel where the top is level, else half the greatest."""
     pixels, top = mask.view(np.uint8), float(height.max())
-    if top - float(height[mask].min()) > LEVEL_TOP * top:
+    if not _is_level(mask, height):
         return top / 2
     outlines, _ = cv2.findContours(pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     rim = sum(cv2.arcLength(outline, True) for outline in outlines) * METRES_PER_PIXEL

@@ -15,6 +15,7 @@ from foretrace.errors import PredictionError, check_type, shown
 from foretrace.geometry import Numbers, finite_array, rotation_vector_to_quaternion
 from foretrace.imagined.belief import RANGES, Belief
 from foretrace.imagined.context import (
+    BEVELS,
     CONSTANTS,
     UNKNOWN,
     Context,
@@ -34,6 +35,7 @@ from foretrace.imagined.domain import (
     check_object,
     check_view,
     estimate_com,
+    level_tops,
     measure,
     measure_candidates,
 )
@@ -106,6 +108,8 @@ class Imaginer(ABC):
     """Whether it can do without constants of its context: its futures then cover what is not told."""
     rests: bool = False
     """Whether imagined motions end with the object at rest and the tool gone, as a sequence of actions needs it."""
+    bevels_all: ClassVar[bool] = False
+    """Whether it gives a bevel even to objects whose top is not level; others have none to be told."""
     observes: ClassVar[bool] = False
     """Whether it can be shown the first samples of a motion that is under way."""
 
@@ -185,8 +189,8 @@ class Imaginer(ABC):
             self._check_action(action)
             parameters = parameters_of([action])
         belief = context if isinstance(context, Belief) else None
-        values = self._told(self._without(belief, context), parameters, 1)
         batch = InteractionBatch.from_views([view])
+        values = self.as_seen(self._told(self._without(belief, context), parameters, 1), batch)
         motion = None if observed is None else observed_motion(observed)
         if com is None and motion is not None and motion.com is not None:
             com = motion.com[0]
@@ -239,6 +243,7 @@ class Imaginer(ABC):
         else:
             known = {name: column_of(batch, name) for name in self.action.nominal_parameters()}
             values = self._told(context, known, len(batch))
+        values = self.as_seen(values, batch)
         com = estimate_com(batch)
         if start == "observed":
             com = batch.com[:, 0] if batch.com.shape[1] else np.full_like(com, np.nan)
@@ -290,7 +295,9 @@ class Imaginer(ABC):
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
         belief = context if isinstance(context, Belief) else None
-        values = self._told(self._without(belief, context), parameters, len(actions))
+        values = self.as_seen(
+            self._told(self._without(belief, context), parameters, len(actions)), candidates
+        )
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
         check_com(view, middle)
         if belief is not None:
@@ -314,6 +321,20 @@ class Imaginer(ABC):
         return given_context(
             self.context, context, parameters, number, self.marginal, kind=self.action, usual=self.nominal
         )
+
+    def as_seen(
+        self, values: Float[np.ndarray, "n context"], source: InteractionBatch | Candidates
+    ) -> Float[np.ndarray, "n context"]:
+        """Context of actions without the bevels of objects that are seen to have none, as a lying cylinder.
+
+        Args:
+            values: The context [SI].
+            source: The views.
+        """
+        bevels = np.isin(self.context, BEVELS)
+        if self.bevels_all or not self.marginal or not bevels.any():
+            return values
+        return np.where(~level_tops(source)[:, None] & bevels, np.nan, values)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
         return self._warned(self.imagine_scenes(scenes), scenes.context, parameters)

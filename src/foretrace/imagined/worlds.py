@@ -107,6 +107,7 @@ def play_worlds(
         context[:, column] = told.get(name, parameters.get(name, np.nan))
     candidates = Candidates(view, actions)
     there = np.einsum("nij,nj->ni", T_moved_own[:, :3, :3], places) + T_moved_own[:, :3, 3]
+    context = imaginer.as_seen(context, candidates)
     imagined = imaginer.imagine_scenes(Scenes(candidates, there, context, "observed", actions=actions))
     return replace(imagined, futures=_moved_back(imagined.futures, T_moved_own))
 

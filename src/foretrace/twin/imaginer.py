@@ -117,6 +117,7 @@ class TwinImaginer(Imaginer):
 
     context = (*CONSTANTS, *LeverUp.units)
     marginal = True
+    bevels_all = True
 
     def __init__(
         self,

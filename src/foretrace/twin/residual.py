@@ -65,6 +65,7 @@ class ResidualImaginer(Imaginer):
     """
 
     marginal = True
+    bevels_all = True
 
     def __init__(
         self, twin: TwinImaginer, network: ResidualNetwork, config: ResidualConfig, interactions: int
