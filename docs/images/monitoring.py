@@ -93,7 +93,7 @@ def draw_beliefs(axes: list[Axes]) -> None:
     prism = ft.Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)])
     loaded = ft.Weighted(prism, LOADED)
     belief = ft.Belief({"com_x": (-0.025, 0.025), "com_y": (-0.025, 0.025)})
-    actions = [ft.LeverUp.at_edge(prism, edge) for edge in (2, 0, 4)]
+    actions = [ft.LeverUp.at_edge(prism, edge) for edge in (1, 3, 0)]
     for k, ax in enumerate(axes):
         if k:
             action = actions[k - 1]
