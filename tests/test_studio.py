@@ -322,13 +322,14 @@ def test_motions_are_drawn_in_the_objects_frame():
 
 
 def test_a_tube_encloses_its_path():
-    path = np.column_stack([np.linspace(0, 0.1, 20), np.zeros(20), 0.02 * np.linspace(0, 1, 20) ** 2])
+    path = np.column_stack([np.linspace(0, 0.1, 20), np.zeros(20), 0.02 + 0.02 * np.linspace(0, 1, 20) ** 2])
     vertices, faces = tube(path, np.full(20, 0.01))
     body = trimesh.Trimesh(vertices, faces)
     gaps = np.linalg.norm(vertices[:, None] - path, axis=2).min(axis=1)
     assert gaps.max() < 0.0101
     assert np.linalg.norm(vertices[4 * 14 :] - 0, axis=1).size  # caps and rings
     assert body.area == pytest.approx(2 * np.pi * 0.01 * 0.102 + 4 * np.pi * 0.01**2, rel=0.12)
+    assert tube(path, np.full(20, 0.05))[0][:, 2].min() == 0.0  # the table's height
     still, _ = tube(np.zeros((5, 3)), np.full(5, 0.01))
     assert np.isfinite(still).all()
 

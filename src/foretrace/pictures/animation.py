@@ -250,10 +250,13 @@ class _Stage:
         band = self.scene.band
         if band.radius is None:
             return None
-        centres, radii = self._pixels(band.path), CM * self._scale[0] * band.radius
+        around = band.path[:, None] + band.radius[:, None, None] * _BALL
+        around[..., 2] = np.maximum(
+            around[..., 2], min(0.0, band.path[:, 2].min())
+        )  # nothing is below the table
         shape = np.zeros(self._size, dtype=np.uint8)
-        discs = centres[:, None] + radii[:, None, None] * _CIRCLE
-        for pair in pairwise(discs):
+        hulls = [convex_hull(self._pixels(points)) for points in around]
+        for pair in pairwise(hulls):
             swept = _fixed(convex_hull(np.concatenate(pair)))
             cv2.fillConvexPoly(shape, swept, (255.0,), cv2.LINE_AA, SUBPIXELS)
         columns, rows = np.flatnonzero(shape.any(axis=0)), np.flatnonzero(shape.any(axis=1))
@@ -272,6 +275,12 @@ class _Stage:
         return np.column_stack([places[:, 0], self._size[0] - places[:, 1]])
 
 
+_BALL = np.concatenate([
+    np.column_stack([np.sqrt(1 - z**2) * np.cos(a), np.sqrt(1 - z**2) * np.sin(a), np.full(32, z)])
+    for z in np.linspace(-1, 1, 17)
+    for a in [np.linspace(0, 2 * np.pi, 32, endpoint=False)]
+])  # fmt: skip
+"""Points on a ball."""
 _CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 32, endpoint=False)) for f in (np.cos, np.sin)])
 
 

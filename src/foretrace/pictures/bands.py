@@ -14,6 +14,9 @@ from matplotlib.patches import Patch
 from foretrace.pictures.style import CM
 
 BAND = {"alpha": 0.18, "linewidth": 0}
+UP = 2
+"""Coordinate above the table."""
+FAR = 1e3
 THIN = {"linewidth": 1.0, "linestyle": (0, (2, 1.5))}
 
 
@@ -47,6 +50,8 @@ class PredictionBand:
         along = () if self.radius is None else zip(self.path[:, columns], self.radius, strict=True)
         discs = [shapely.Point(*point).buffer(radius) for point, radius in along]
         swept = shapely.union_all([shapely.union(a, b).convex_hull for a, b in pairwise(discs)])
+        if columns[1] == UP and len(self.path):
+            swept = shapely.intersection(swept, shapely.box(-FAR, self._ground, FAR, FAR))
         for part in shapely.get_parts(swept):
             ring = shapely.get_coordinates(part.exterior)
             ax.fill(*ring.T * CM, facecolor=color, zorder=3, **BAND)
@@ -58,8 +63,15 @@ class PredictionBand:
         for _, path in self.others:
             ax.plot(times, path[:, column] * CM, color=color, **THIN)
         if self.radius is not None:
-            low, high = ((self.path[:, column] + sign * self.radius) * CM for sign in (-1, 1))
-            ax.fill_between(times, low, high, facecolor=color, **BAND)
+            low, high = (self.path[:, column] + sign * self.radius for sign in (-1, 1))
+            if column == UP:
+                low = np.maximum(low, self._ground)
+            ax.fill_between(times, low * CM, high * CM, facecolor=color, **BAND)
+
+    @property
+    def _ground(self) -> float:
+        """Height below which nothing is [m]: the table's, unless the path itself leads below it."""
+        return float(min(0.0, self.path[:, UP].min()))
 
     def handles(self, color: str) -> list[Line2D | Patch]:
         """Legend entries."""

@@ -147,6 +147,7 @@ def tube(path: Float[np.ndarray, "time 3"], radius: Float[np.ndarray, " time"]) 
     small = np.concatenate([share, np.ones(count), share[::-1]])
     offsets = back[:, None, None] * tangents[which][:, None] + small[:, None, None] * around[which]
     rings = centres[which][:, None] + wide[which][:, None, None] * offsets
+    rings[..., 2] = np.maximum(rings[..., 2], min(0.0, centres[:, 2].min()))  # nothing is below the table
     here = np.arange(SIDES)
     after = np.roll(here, -1)
     quads = np.concatenate(

@@ -19,8 +19,8 @@ const Shapes = (() => {
     }));
   }
 
-  /** The surface about a path, round at both ends: `radius` is one for each point. */
-  function tube(path, radius, sides = 14) {
+  /** The surface about a path, round at both ends: `radius` is one for each point; nothing is below `lowest`. */
+  function tube(path, radius, sides = 14, lowest = -Infinity) {
     const kept = path.reduce((found, point, k) => {
       const last = path[found[found.length - 1]];
       return !found.length || Math.hypot(...Vector.add(point, last, -1)) > 1e-4 ? [...found, k] : found;
@@ -35,7 +35,8 @@ const Shapes = (() => {
       const other = Vector.cross(ahead, side);
       const ring = (back, small) => Array.from({ length: sides }, (_, i) => {
         const angle = (2 * Math.PI * i) / sides, [c, s] = [small * Math.cos(angle), small * Math.sin(angle)];
-        return centre.map((value, n) => value + wide[k] * (back * ahead[n] + c * side[n] + s * other[n]));
+        const at = centre.map((value, n) => value + wide[k] * (back * ahead[n] + c * side[n] + s * other[n]));
+        return [at[0], at[1], Math.max(at[2], lowest)];
       });
       const ends = [[0.15, 0.989], [0.6, 0.8], [0.9, 0.436]]; // rings beyond an end: radius and distance
       if (k === 0) return [...ends.map(([small, back]) => ring(-back, small)), ring(0, 1)];

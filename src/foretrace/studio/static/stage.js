@@ -50,7 +50,8 @@ class Stage {
       const wide = motion.radius && Math.max(...motion.radius);
       if (tubes && motion.radius && !(k && wide > FACTS.wide)) {
         const radius = motion.radius.map((value) => Math.min(value, 0.2));
-        scene.put(`tube ${k}`, Shapes.tube(path, radius), { colour, opacity: !k && wide < FACTS.wide ? 0.3 : 0.13 });
+        const table = Math.min(0, ...path.map((point) => point[2]));
+        scene.put(`tube ${k}`, Shapes.tube(path, radius, 14, table), { colour, opacity: !k && wide < FACTS.wide ? 0.3 : 0.13 });
       }
       const poses = motion.com.map((at, t) => {
         const turn = Matrix.turned(motion.turn[t]);
