@@ -8,6 +8,7 @@ import pytest
 import foretrace as ft
 from foretrace.errors import MonitoringError, PredictionError
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes
+from foretrace.imagined.belief import NOMINAL_BEVEL
 from foretrace.monitoring import identification
 
 TIMES = 0.1 * np.arange(20)
@@ -85,12 +86,13 @@ def test_the_contact_of_an_execution_to_come_may_be_off_by_as_much_as_before():
     assert np.ptp(worlds.values["contact_left"][:256]) > 0.98 * (high - low)
 
 
-def test_a_bevel_is_the_nominal_one_unless_it_is_given_a_range():
-    fixed, open_ = ft.Belief(), ft.Belief({"bevel_height": (0.002, 0.004)})
+def test_a_bevel_is_believed_in_as_all_else():
+    fixed, open_ = ft.Belief(NOMINAL_BEVEL), ft.Belief({"bevel_height": (0.002, 0.004)})
     assert set(fixed.sample(50)["bevel_height"]) == {0.003}
     assert np.ptp(open_.sample(50)["bevel_height"]) > 0.0015
     assert "bevel_height" not in repr(fixed)
     assert "bevel_height" in repr(open_)
+    assert 0.0005 < np.ptp(ft.Belief().sample(50)["bevel_height"]) < 0.0012
     note = Slider().imagine(VIEW, ACTION, context=open_).warnings
     assert any("bevel_height make no difference" in line for line in note)
 

@@ -13,6 +13,7 @@ from foretrace.experiments.executions import make_execution
 from foretrace.experiments.monitor_calibration import imagine
 from foretrace.geometry import matrix_to_pose, pose_to_matrix, rotation_vector_to_quaternion
 from foretrace.imagined import LEVELS, Futures, ImaginedEffect
+from foretrace.imagined.belief import NOMINAL_BEVEL
 from foretrace.interactions.dataset import Dataset
 from foretrace.monitoring import Drift, MonitorCalibration, Verdict
 from foretrace.monitoring.causes import BAD_INPUT, FROZEN, LOST, CauseModel
@@ -327,6 +328,7 @@ def predictor():
 
 
 FIXED = {
+    **NOMINAL_BEVEL,
     "friction": (0.9, 0.9),
     "tool_friction": (0.3, 0.3),
     "density": (600.0, 600.0),

@@ -24,7 +24,7 @@ from foretrace.experiments.monitor_calibration import predictor
 from foretrace.files import short_hash
 from foretrace.geometry import quaternion_to_matrix
 from foretrace.imagined import Belief, ObservedMotion
-from foretrace.imagined.belief import RANGES
+from foretrace.imagined.belief import NOMINAL_BEVEL, RANGES
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import identify
@@ -92,7 +92,7 @@ class Identification(Experiment):
         rng = np.random.default_rng([self.seed, trial.object])
         case = _draw(rng)
         rows: list[Row] = []
-        belief = first_prior()
+        belief = first_prior(NOMINAL_BEVEL)
         learning = choosing = 0.0
         twin = TwinImaginer(config=TwinConfig(workers=1)) if self.exact else None
         for k in range(self.lever_ups):

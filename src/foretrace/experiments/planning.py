@@ -28,6 +28,7 @@ from foretrace.experiments.planning_rules import ClosedForm, choose_by_rule
 from foretrace.experiments.transfer_objects import Subject, read_silhouettes
 from foretrace.files import short_hash
 from foretrace.imagined import Belief, Futures, ImaginedBatch, Imaginer, estimate_com
+from foretrace.imagined.belief import NOMINAL_BEVEL
 from foretrace.imagined.observed import rotations_since_rest
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Interaction, Physics
@@ -53,7 +54,7 @@ LEAST_FREE = 12
 """An object with fewer free contacts is drawn anew."""
 STREAM = 71
 """Tells the random numbers of these objects from those of data sets with the same seed."""
-BELIEVED = Belief(worlds=8)
+BELIEVED = Belief(NOMINAL_BEVEL, worlds=8)
 """What is believed of frictions and density before the first lever-up, and the draws that a plan averages over."""
 DISTANCE = 0.03
 """How far away the place of goal ``move-to`` is [m]."""

@@ -17,15 +17,16 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "density": (300.0, 1200.0),
     "com_x": (0.0, 0.0),
     "com_y": (0.0, 0.0),
-    "bevel_width": (BEVEL.width, BEVEL.width),
-    "bevel_height": (BEVEL.height, BEVEL.height),
+    "bevel_width": (0.8 * BEVEL.width, 1.2 * BEVEL.width),
+    "bevel_height": (0.8 * BEVEL.height, 1.2 * BEVEL.height),
     "contact_ahead": (-0.003, 0.003),
     "contact_left": (-0.003, 0.003),
     "contact_turn": (-float(np.deg2rad(3.0)), float(np.deg2rad(3.0))),
 }
 """Ranges of the default prior, those of randomised data sets [SI]. ``com_x`` and ``com_y``: distance of the centre of
-mass from where it was given or estimated, in the object frame. ``bevel_...``: its bevel, by default the nominal one.
-``contact_...``: execution error (`ExecutionOffset`)."""
+mass from where it was given or estimated, in the object frame. ``contact_...``: execution error (`ExecutionOffset`)."""
+NOMINAL_BEVEL = {"bevel_width": (BEVEL.width, BEVEL.width), "bevel_height": (BEVEL.height, BEVEL.height)}
+"""Ranges where the object is known to have the nominal bevel [m]."""
 EXECUTION = ("contact_ahead", "contact_left", "contact_turn")
 """What differs between executions on the same object."""
 COM = ("com_x", "com_y")

@@ -1,6 +1,8 @@
 """What an execution tells of its constants: frictions, place of the centre of mass, error of the contact."""
 
+from collections.abc import Mapping
 from itertools import pairwise
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -47,9 +49,13 @@ TAIL = 3.0
 """Degrees of freedom of the likelihood (Student): a few samples that are far off do not decide."""
 
 
-def first_prior() -> Belief:
-    """What is believed of an object before its first action: usual ranges, its centre of mass within `COM_RANGE`."""
-    return Belief(dict.fromkeys(COM, (-COM_RANGE, COM_RANGE)))
+def first_prior(known: Mapping[str, tuple[float, float]] = MappingProxyType({})) -> Belief:
+    """What is believed of an object before its first action: usual ranges, its centre of mass within `COM_RANGE`.
+
+    Args:
+        known: Narrower ranges by name [SI].
+    """
+    return Belief(dict.fromkeys(COM, (-COM_RANGE, COM_RANGE)) | dict(known))
 
 
 def identify(
