@@ -93,7 +93,7 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
                                  "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
     "identification": lambda root: {"objects": 1, "lever_ups": 1},
     "monitoring": lambda root: {"executions": 2, "faults": 1, "successes": 2,
-                                "parts": ("calibration", "normal", "slip", "freeze")},
+                                "parts": ("calibration", "normal", "round and dented outlines", "slip", "freeze")},
     "shipped": lambda root: {"objects": 2, "twin": True},
     "pushes": lambda root: dict(zip(("pushes", "shapes"), factories.write_push_table(root, 90), strict=True))
                            | {"methods": ("nearest", "simulation", "learned")},

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from foretrace.actions import LeverUp
+from foretrace.actions import LeverUp, sample_reachable_contacts
 from foretrace.errors import ShapeError, ViewError
 from foretrace.geometry import (
     invert_transform,
@@ -27,6 +27,7 @@ from foretrace.objects import ObjectModel, Prism, Weighted, sample_prism
 from foretrace.simulation.engine import sample_tool
 from foretrace.simulation.mujoco_engine import plan_carriage
 from foretrace.simulation.randomisation import RANDOMISED
+from foretrace.simulation.recipes import ROUND
 from foretrace.simulation.scene import build_scene
 
 FAULTS = ("slip", "missed", "fixed", "pushed", "friction", "off centre", "other shape", "freeze", "jump")
@@ -89,18 +90,39 @@ class Execution:
         return np.maximum.accumulate(np.linalg.norm(apart, axis=-1).max(axis=0))
 
 
-def make_execution(seed: int, number: int, fault: str = "") -> Execution:
+Draw = Callable[[np.random.Generator], tuple[Prism, LeverUp]]
+"""Draws an object and a lever-up of it."""
+
+
+def draw_polygon(rng: np.random.Generator) -> tuple[Prism, LeverUp]:
+    """A polygon of the paper's kind, levered along an edge."""
+    prism = sample_prism(rng, int(rng.integers(3, 11)))
+    return prism, LeverUp.at_edge(prism, int(rng.integers(len(prism.corners))), rng.uniform(0.15, 0.85))
+
+
+def draw_round(rng: np.random.Generator) -> tuple[Prism, LeverUp]:
+    """A flat object with a round, organic or dented outline, levered anywhere that a blade gets to."""
+    families = list(ROUND.values())
+    return reachable(families[int(rng.integers(len(families)))](rng), rng)
+
+
+def reachable(prism: Prism, rng: np.random.Generator) -> tuple[Prism, LeverUp]:
+    """An object, levered anywhere that a blade gets to."""
+    return prism, sample_reachable_contacts(prism, rng, 1)[0]
+
+
+def make_execution(seed: int, number: int, fault: str = "", draw: Draw = draw_polygon) -> Execution:
     """One execution, decided by its seed, number and fault.
 
     Args:
         seed: Seed of the set.
         number: Number within the set.
         fault: One of FAULTS, or empty.
+        draw: Draws object and action.
     """
     rng = np.random.default_rng([seed, number, FAULTS.index(fault) + 1 if fault else 0])
     while True:
-        prism = sample_prism(rng, int(rng.integers(3, 11)))
-        action = LeverUp.at_edge(prism, int(rng.integers(len(prism.corners))), rng.uniform(0.15, 0.85))
+        prism, action = draw(rng)
         try:
             view = TopDownView.of(prism, action)
             varied, physics, _, offset = RANDOMISED.vary(prism, Physics(), action.path, rng)

@@ -7,6 +7,7 @@ executions of a third seed.
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from foretrace.actions import LeverUp
 from foretrace.errors import ResultsError
 from foretrace.evaluation.charts import GREEN, ORANGE, SKY, VERMILLION, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.tables import markdown_table, number
 from foretrace.experiments import SUMMARIES
-from foretrace.experiments.executions import FAULTS, Execution, make_execution
+from foretrace.experiments.executions import (
+    FAULTS,
+    Execution,
+    draw_polygon,
+    draw_round,
+    make_execution,
+    reachable,
+)
 from foretrace.experiments.monitor_calibration import SEED, imagine, path_of
 from foretrace.experiments.monitoring_tables import (
     CALIBRATION,
@@ -37,11 +46,13 @@ from foretrace.experiments.monitoring_tables import (
     pick,
     scores_of,
 )
+from foretrace.experiments.transfer_objects import read_silhouettes
 from foretrace.experiments.window_density import successes, unlikeness
 from foretrace.files import short_hash
 from foretrace.imagined import ImaginedEffect, conformal_scores
 from foretrace.monitoring import Monitor, MonitorCalibration, Verdict
 from foretrace.monitoring.calibration import SHIPPED
+from foretrace.objects import Prism
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor.loading import default_checkpoint
 
@@ -65,6 +76,11 @@ METHODS = {
     "density of windows": "#5b3a8e",
 }
 """What is compared, with its colour."""
+OUTLINES, SILHOUETTES = "round and dented outlines", "silhouettes"
+OTHERS = (OUTLINES, SILHOUETTES)
+"""Other objects than those that the monitor was calibrated with; nothing goes wrong with them."""
+FEWER = 4
+"""Times that there are fewer executions with them."""
 NONE = -1.0
 """There is no such number."""
 
@@ -74,7 +90,7 @@ class MonitoringTrial(Trial):
     """Some executions of one kind."""
 
     part: str
-    """``calibration``, ``normal`` or a fault."""
+    """``calibration``, ``normal``, one of OTHERS, or a fault."""
     chunk: int
     """Which of them."""
 
@@ -93,6 +109,8 @@ class Monitoring(Experiment):
     """Share of normal executions that may alarm."""
     successes: int = 200
     """Normal executions that the density of windows is learned from."""
+    silhouettes: Path | None = None
+    """Folder of pictures of silhouettes, of which there are normal executions, too; without one, they are left out."""
 
     label = "monitoring"
     summary = SUMMARIES["monitoring"]
@@ -105,13 +123,18 @@ class Monitoring(Experiment):
                 f"executions is {self.executions}, faults is {self.faults}, successes is {self.successes}: give at "
                 "least 1 of each"
             )
-        known = (CALIBRATION, NORMAL, *FAULTS)
+        known = (
+            CALIBRATION,
+            NORMAL,
+            *(part for part in OTHERS if part != SILHOUETTES or self.silhouettes),
+            *FAULTS,
+        )
         if unknown := [part for part in self.parts if part not in known]:
             raise ResultsError(f"part {unknown[0]!r} is unknown: choose from {', '.join(known)}")
         return [
             MonitoringTrial(part, chunk)
             for part in self.parts or known
-            for chunk in range(-(-(self.faults if part in FAULTS else self.executions) // CHUNK))
+            for chunk in range(-(-self._count(part) // CHUNK))
         ]
 
     def identity(self) -> dict[str, Any] | None:
@@ -119,19 +142,38 @@ class Monitoring(Experiment):
         config = (default_checkpoint() / "config.json").read_bytes()
         made = {"predictor": short_hash([config]), "calibration": short_hash([SHIPPED.read_bytes()])}
         own = {"false_alarms": self.false_alarms, "successes": self.successes}
-        return {**made, "seeds": SEEDS, **own}
+        pictures = {} if self.silhouettes is None else {"silhouettes": short_hash([*self._pictures()])}
+        return {**made, "seeds": SEEDS, **own, **pictures}
 
     def run(self, trial: MonitoringTrial, folder: Path) -> Sequence[Row]:
         """Scores, alarms, causes and errors of executions."""
         fault = trial.part if trial.part in FAULTS else ""
-        total = self.faults if fault else self.executions
-        numbers = range(CHUNK * trial.chunk, min(CHUNK * (trial.chunk + 1), total))
+        numbers = range(CHUNK * trial.chunk, min(CHUNK * (trial.chunk + 1), self._count(trial.part)))
         seed = SEEDS.get(trial.part, SEEDS[NORMAL])
         known = successes(self.successes, SEED + 3)
+        draw = {OUTLINES: draw_round, SILHOUETTES: self._draw_silhouette}.get(trial.part, draw_polygon)
         return [
             watch(made, k, self.false_alarms) | {"windows": CM * unlikeness(made.tracked, known)}
-            for k, made in ((k, make_execution(seed, k, fault)) for k in numbers)
+            for k, made in ((k, make_execution(seed, k, fault, draw)) for k in numbers)
         ]
+
+    def _count(self, part: str) -> int:
+        """Number of executions of a part."""
+        if part in FAULTS:
+            return self.faults
+        return -(-self.executions // FEWER) if part in OTHERS else self.executions
+
+    def _pictures(self) -> list[bytes]:
+        assert self.silhouettes is not None
+        return [repr(prism.corners.tolist()).encode() for prism in self._silhouettes]
+
+    @cached_property
+    def _silhouettes(self) -> list[Prism]:
+        assert self.silhouettes is not None
+        return [subject.obj for subject in read_silhouettes(self.silhouettes)]
+
+    def _draw_silhouette(self, rng: np.random.Generator) -> tuple[Prism, LeverUp]:
+        return reachable(self._silhouettes[int(rng.integers(len(self._silhouettes)))], rng)
 
     def summarise(self, rows: pd.DataFrame) -> dict[str, Any]:
         """False alarms, AUROC, detections, delays, causes and rests."""
@@ -140,6 +182,7 @@ class Monitoring(Experiment):
         if not normal.any():
             return {}
         summary: dict[str, Any] = {"normal": int(normal.sum()), "faults": {}, "methods": {}}
+        alarmed = table["score"] > table["threshold"]
         of = {fault: wrong & (table["part"] == fault) for fault in FAULTS}
         of = {fault: mine for fault, mine in of.items() if mine.any()}
         for method, (values, threshold) in scores_of(table).items():
@@ -151,6 +194,11 @@ class Monitoring(Experiment):
             }
         summary["faults"] = {fault: about_faults(pick(table, mine)) for fault, mine in of.items()}
         summary["all_faults"] = about_faults(pick(table, wrong)) if wrong.any() else {}
+        summary["others"] = {
+            part: {"executions": int(mine.sum()), "false_alarms": float(np.mean(alarmed[mine]))}
+            for part in OTHERS
+            if (mine := table["part"] == part).any()
+        }
         summary["rest"] = about_rests(pick(table, normal))
         summary["drift"] = drift_after(table, MonitorCalibration.shipped("worlds"))
         summary["update_ms"] = float(np.median(table["update_ms"]))
@@ -167,6 +215,11 @@ class Monitoring(Experiment):
             for name, each in summary["methods"].items()
         ]
         parts.append(markdown_table(["", "False alarms", "Detected", "AUROC"], lines))
+        parts += [
+            f"False alarms of the monitor, {part}: {100 * each['false_alarms']:.1f} % of {each['executions']} normal "
+            "executions."
+            for part, each in summary["others"].items()
+        ]
         head = [
             "Fault",
             "Executions",
