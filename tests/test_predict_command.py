@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 import foretrace as ft
@@ -134,6 +135,31 @@ def test_many_contacts_and_images_give_the_predictions_of_one_by_one(tmp_path: P
     moved = np.hypot(float(row["moved_x_m"]), float(row["moved_y_m"]))
     assert moved == pytest.approx(np.linalg.norm((path[-1] - path[0])[:2]), abs=0.002)
     assert float(row["moved_x_m"]) > 0.02, "away from the blade, in the image's frame"
+
+
+def test_the_bevel_is_the_object_s_and_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["predict", *OBJECT, "--contact", *map(str, CONTACT), "--no-animation", "--out"]
+    assert cli.main([*command, str(tmp_path / "own"), "--bevel-height", "0.0024", "--compare"]) == 0
+    assert cli.main([*command, str(tmp_path / "nominal")]) == 0
+    own, nominal = (
+        json.loads((tmp_path / name / "trajectory.json").read_text()) for name in ("own", "nominal")
+    )
+    assert (own["object"]["bevel"][1], nominal["object"]["bevel"][1]) == (0.0024, 0.003)
+    assert own["simulated"]["outcome"] == "levered"
+    apart = np.abs(np.subtract(own["com_trajectory"], nominal["com_trajectory"])).max()
+    assert 0.0002 < apart < 0.02
+    capsys.readouterr()
+    assert cli.main([*command, str(tmp_path / "high"), "--bevel-height", "0.5"]) == 2
+    assert "bevel of height 0.5 m" in capsys.readouterr().err
+    box = tmp_path / "box.stl"
+    trimesh.creation.box((0.1, 0.08, 0.03)).export(box)
+    assert (
+        cli.main(
+            ["predict", "--mesh", str(box), "--edge", "0", "--bevel-width", "0.005", "--out", str(tmp_path)]
+        )
+        == 2
+    )
+    assert "--bevel-width is for outlines" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

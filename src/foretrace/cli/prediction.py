@@ -17,7 +17,7 @@ from foretrace.cli.futures import say_futures
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
-from foretrace.imagined.context import EXACT, context_units, nominal_constants
+from foretrace.imagined.context import BEVELS, EXACT, context_units, nominal_constants
 from foretrace.imagined.shown import LEVEL, radius_of
 from foretrace.perception.example import EXAMPLE
 from foretrace.perception.photo import PhotoConfig
@@ -117,6 +117,7 @@ def predict(
             raise PredictionError(f"{', '.join(idle)} goes with --photo: give one, or leave it out")
         object, action, view, com = _object_and_action(obj, at, kind)
     action = replace(action, path=path)
+    object = _bevelled(object, values)
     imagined = predictor.imagine(view, action, context=told, com=com)
     truth = _simulate(object, action, values) if compare else None
     say_futures(imagined)
@@ -214,6 +215,27 @@ def _told(given: dict[str, float], context: tuple[str, ...], unknown: bool) -> d
     """What the predictor is told: values that were given, and nominal constants unless only the former are known."""
     usual = {} if unknown else {name: value for name, value in nominal_constants().items() if name in context}
     return usual | {name: value for name, value in given.items() if name in context}
+
+
+def _bevelled(obj: "ObjectModel", given: dict[str, float]) -> "ObjectModel":
+    """The object with the bevel that was given.
+
+    Raises:
+        PredictionError: It is no prism.
+        ShapeError: It bears no such bevel.
+    """
+    from foretrace.objects import Bevel, Prism
+
+    found = [name for name in BEVELS if name in given]
+    if not found:
+        return obj
+    if type(obj) is not Prism:
+        option = f"--{found[0].replace('_', '-')}"
+        raise PredictionError(f"{option} is for outlines; the object is a {type(obj).__name__}: leave it out")
+    width, height = (
+        given.get(name, own) for name, own in zip(BEVELS, (obj.bevel.width, obj.bevel.height), strict=True)
+    )
+    return Prism(obj.corners, obj.height, Bevel(width, height))
 
 
 def _simulate(obj: "ObjectModel", action: "Action", given: dict[str, float]) -> "Interaction":
