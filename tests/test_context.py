@@ -14,12 +14,19 @@ from foretrace.cli.prediction import _given_context
 from foretrace.errors import CheckpointError, PredictionError, TrainingError
 from foretrace.evaluation.metrics import measure_errors
 from foretrace.imagined import LEVELS
-from foretrace.imagined.context import CONSTANTS, context_units, nominal_parameters, true_context
+from foretrace.imagined.context import (
+    CONSTANTS,
+    context_units,
+    nominal_constants,
+    nominal_parameters,
+    told_of,
+    true_context,
+)
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import split_by_seed
 from foretrace.interactions.topdown import TopDownView
-from foretrace.objects import Box, Cylinder
+from foretrace.objects import Box, Cylinder, Prism
 from foretrace.predictor import LstmConfig, OneShotConfig, TrainConfig, load_predictor, train_predictor
 from foretrace.predictor.checkpoint import read_config
 from foretrace.predictor.run_folder import fingerprint
@@ -383,3 +390,64 @@ def test_a_lying_cylinder_is_told_no_bevel():
         TopDownView.of(cylinder, LeverUp((0.0, -0.025), (0.0, 1.0)))
     ).futures.outcomes()
     assert rolled["rolled"][0] > 0.5
+
+
+PENTAGON = Prism([(0.09, 0.0), (0.02, 0.08), (-0.07, 0.05), (-0.08, -0.04), (0.03, -0.08)])
+
+
+def seen(obj, edge):
+    action = LeverUp.at_edge(obj, edge)
+    return TopDownView.of(obj, action), action
+
+
+def test_a_context_unlike_what_was_learned_is_pointed_out():
+    predictor, (view, action) = load_predictor(), seen(PENTAGON, 2)
+    for context, words in (
+        (
+            {"bevel_height": 0.0015},
+            "bevel_height 1.5 mm is far outside what was learned from, 2.28 to 3.59 mm",
+        ),
+        ({"speed": 3.0}, "speed 3 is far outside"),
+        ({"friction": 2.0}, "friction 2 is far outside"),
+    ):
+        assert any(words in line for line in predictor.imagine(view, context=context).warnings)
+    slow = replace(action, path=ToolPath.of(speed=0.3))
+    assert any("speed 0.3 is far outside" in line for line in predictor.imagine(view, slow).warnings)
+    assert not predictor.imagine(view, action).warnings
+
+
+@pytest.mark.parametrize(
+    ("context", "words"),
+    [
+        ({"speed": 0.0}, "context speed: tool path: speed = 0"),
+        (
+            {"bevel_width": 0.0, "bevel_height": 0.003},
+            r"context bevel_width is 0\.0, bevel_height is 0\.003: give two",
+        ),
+        ({"bevel_width": 0.2}, r"context bevel_width is 0\.2: give a value from 0 to 0\.1"),
+    ],
+)
+def test_a_context_that_no_action_or_object_has(context, words):
+    with pytest.raises(PredictionError, match=words):
+        load_predictor().imagine(seen(PENTAGON, 2)[0], context=context)
+
+
+def test_slender_objects_are_told_the_bevel_that_they_bear():
+    predictor, slender = load_predictor(), Box(0.16, 0.02, 0.02)
+    view, action = seen(slender, 0)
+    told = predictor.imagine(view, action).context
+    assert told["bevel_width"] == pytest.approx(slender.bevel.width, rel=0.15) != 0.009
+    assert told["bevel_height"] == pytest.approx(slender.bevel.height, rel=0.15)
+    own = dict(zip(("bevel_width", "bevel_height"), (slender.bevel.width, slender.bevel.height), strict=True))
+    assert told_of(slender, predictor.context) == dict(nominal_constants()) | own
+    assert told_of(PENTAGON, predictor.context) is None
+    assert told_of(slender, ("friction",)) is None
+    bare = InteractionBatch.from_views([view])
+    same = predictor.imagine_batch(bare, "estimated", context=None).com[0]
+    np.testing.assert_allclose(same, predictor.imagine(view).com_trajectory, atol=1e-7)
+
+
+def test_an_object_without_a_bevel_is_told_none():
+    view, action = seen(PENTAGON, 2)
+    imagined = load_predictor().imagine(view, action, context={"bevel_width": 0.0, "bevel_height": 0.0})
+    assert np.isnan(imagined.context["bevel_width"])

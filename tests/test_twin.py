@@ -231,6 +231,10 @@ def test_a_told_bevel_is_that_of_the_object():
     spread = twin.imagine(view, action, context=TOLD).futures.spread
     assert np.nanmax(spread) > 0.0005  # where it is not told, it varies
     assert np.isnan(alone.futures.spread).all()
+    wide, narrow = (twin.imagine(view, action, context=TOLD | {"bevel_width": w}) for w in (0.012, 0.007))
+    assert np.abs(wide.com_trajectory - narrow.com_trajectory).max() > 1e-4
+    high = twin.imagine(view, action, context=nominal | {"bevel_height": 0.03})
+    assert any("a bevel of 9 x 30 mm does not fit the object" in line for line in high.warnings)
     with pytest.raises(PredictionError, match=r"context bevel_width is 0\.5: give a value from 0 to 0\.1"):
         twin.imagine(view, action, context=nominal | {"bevel_width": 0.5})
 

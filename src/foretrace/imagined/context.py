@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import ACTIONS, Action
-from foretrace.errors import PredictionError, TrainingError, is_number, shown
+from foretrace.errors import ForetraceError, PredictionError, TrainingError, is_number, shown
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import PHYSICS_RANGES, Physics
-from foretrace.objects import BEVEL
+from foretrace.objects import BEVEL, ObjectModel, Prism
 
 CONSTANTS = {
     "friction": "of object and table",
@@ -187,7 +187,13 @@ def given_context(
                 raise PredictionError(
                     f"context {name} is {value}, the action's path has {planned}: give one of the two"
                 )
-    planned = dict(parameters) if parameters else dict(nominal)
+    wanted = {name: told[name] for name in told if name in (kind or first_action()).nominal_parameters()}
+    try:
+        (kind or first_action()).path_of(**wanted)
+    except ForetraceError as reason:
+        raise PredictionError(f"context {', '.join(wanted)}: {reason}") from None
+    usually = {name: np.where(np.isnan(each), nominal[name], each) for name, each in parameters.items()}
+    planned = usually or dict(nominal)
     found = np.full((number, len(names)), np.nan)
     for k, name in enumerate(names):
         found[:, k] = told.get(name, planned.get(name, np.nan))
@@ -231,11 +237,33 @@ def _told(
         low, high = RANGES.get(name, (-np.inf, np.inf))
         if not low <= float(value) <= high:
             raise PredictionError(f"context {name} is {shown(value)}: give a value from {low:g} to {high:g}")
+    if sum(context.get(name) == 0 for name in BEVELS) == 1:
+        raise PredictionError(
+            f"context bevel_width is {context.get(BEVELS[0])}, bevel_height is {context.get(BEVELS[1])}: give two "
+            "numbers above 0, or 0 twice for an object without a bevel"
+        )
     if context.get(EXACT, 0) != 0:
         raise PredictionError(
             f"context {EXACT} is {shown(context[EXACT])}: give 0 for a contact as commanded, or leave it out"
         )
     return dict(context)
+
+
+def told_of(obj: ObjectModel, *contexts: Sequence[str]) -> Context:
+    """What is told of a known object by default: the nominal constants and its own bevel.
+
+    Args:
+        obj: The object.
+        contexts: Contexts of the imaginers that are told.
+
+    Returns:
+        None where that is the same as telling the nominal constants, or an imaginer is not conditioned on all of them.
+    """
+    nominal = nominal_constants()
+    bevel = obj.bevel if isinstance(obj, Prism) else BEVEL
+    if bevel == BEVEL or any(name not in context for name in nominal for context in contexts):
+        return None
+    return {**nominal, **dict(zip(BEVELS, (bevel.width, bevel.height), strict=True))}
 
 
 def find_unconditioned(

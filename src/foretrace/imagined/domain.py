@@ -33,9 +33,31 @@ MEASURES = {
     "height": (100.0, "cm"),
     "distance": (100.0, "cm"),
     "corners": (1.0, ""),
+    "friction": (1.0, ""),
+    "tool_friction": (1.0, ""),
+    "density": (1.0, "kg/m^3"),
+    "bevel_width": (1e3, "mm"),
+    "bevel_height": (1e3, "mm"),
+    "insertion": (100.0, "cm"),
+    "arc_radius": (100.0, "cm"),
+    "sweep": (180.0 / np.pi, "degrees"),
+    "speed": (1.0, ""),
 }
-"""Measures by which objects are compared: factor from SI units to the unit of messages, and that unit. Length and width
-are along and across the action, the distance is that from contact to centre of mass in the plane."""
+"""Measures by which objects, and what is told of them, are compared: factor from SI units to the unit of messages, and
+that unit. Length and width are along and across the action, the distance is that from contact to centre of mass in the
+plane."""
+TOLD = (
+    "friction",
+    "tool_friction",
+    "density",
+    "bevel_width",
+    "bevel_height",
+    "insertion",
+    "arc_radius",
+    "sweep",
+    "speed",
+)
+"""Those of the context."""
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper end of measures in a training part, by name [SI]."""
@@ -279,6 +301,31 @@ def measure_candidates(
     }
 
 
+def measure_context(
+    names: Sequence[str], values: Float[np.ndarray, "batch context"]
+) -> dict[str, Float[np.ndarray, " batch"]]:
+    """Measures of what is told [SI], by the names of ``TOLD``; NaN where it is not.
+
+    Args:
+        names: Names of the context.
+        values: Its values.
+    """
+    return {name: values[:, k] for k, name in enumerate(names) if name in TOLD}
+
+
+def bevel_scales(source: InteractionBatch | Candidates) -> Float[np.ndarray, " batch"]:
+    """Share of the nominal bevel that each object bears: 1, or less for a slender or thin one."""
+    if isinstance(source, Candidates):
+        return np.full(len(source.actions), _bevel_scale(source.view.mask, source.view.height))
+    return np.array([_bevel_scale(*view) for view in zip(source.mask, source.height, strict=True)])
+
+
+def _bevel_scale(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, "128 128"]) -> float:
+    pixels = np.pad(mask.view(np.uint8), 1)
+    inner = float(cv2.distanceTransform(pixels, cv2.DIST_L2, 5).max()) * METRES_PER_PIXEL
+    return min(1.0, 0.5 * inner / BEVEL.width, 0.5 * float(height.max()) / BEVEL.height)
+
+
 def estimate_com(batch: InteractionBatch) -> Float[np.ndarray, "batch 3"]:
     """Centres of mass at rest in the action frame [m], estimated from the views.
 
@@ -319,8 +366,7 @@ def _centre_height(mask: Bool[np.ndarray, "128 128"], height: Float[np.ndarray, 
         return top / 2
     outlines, _ = cv2.findContours(pixels, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     rim = sum(cv2.arcLength(outline, True) for outline in outlines) * METRES_PER_PIXEL
-    inner = float(cv2.distanceTransform(np.pad(pixels, 1), cv2.DIST_L2, 5).max()) * METRES_PER_PIXEL
-    scale = min(1.0, 0.5 * inner / BEVEL.width, 0.5 * top / BEVEL.height)
+    scale = _bevel_scale(mask, height)
     low = scale * BEVEL.height
     whole, cut = np.count_nonzero(mask) * METRES_PER_PIXEL**2 * top, rim * scale * BEVEL.width * low / 2
     return (whole * top / 2 - cut * low / 3) / (whole - cut)
@@ -332,10 +378,12 @@ def _extent(filled: np.ndarray) -> Float[np.ndarray, " batch"]:
 
 
 def ranges_of(measures: Mapping[str, Float[np.ndarray, " batch"]]) -> dict[str, tuple[float, float]]:
-    """Range of each measure in a training part."""
+    """Range of each measure in a training part; of what was never told there is none."""
+    found = {name: values[np.isfinite(values)] for name, values in measures.items()}
     return {
         name: (float(np.quantile(values, QUANTILES[0])), float(np.quantile(values, QUANTILES[1])))
-        for name, values in measures.items()
+        for name, values in found.items()
+        if len(values)
     }
 
 

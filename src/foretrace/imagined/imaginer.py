@@ -29,6 +29,7 @@ from foretrace.imagined.context import (
 )
 from foretrace.imagined.domain import (
     OWN,
+    bevel_scales,
     check_arrays,
     check_com,
     check_contacts,
@@ -190,7 +191,8 @@ class Imaginer(ABC):
             parameters = parameters_of([action])
         belief = context if isinstance(context, Belief) else None
         batch = InteractionBatch.from_views([view])
-        values = self.as_seen(self._told(self._without(belief, context), parameters, 1), batch)
+        values = self._told(self._without(belief, context), parameters, 1)
+        values = self.as_seen(values, batch, context is None)
         motion = None if observed is None else observed_motion(observed)
         if com is None and motion is not None and motion.com is not None:
             com = motion.com[0]
@@ -243,7 +245,7 @@ class Imaginer(ABC):
         else:
             known = {name: column_of(batch, name) for name in self.action.nominal_parameters()}
             values = self._told(context, known, len(batch))
-        values = self.as_seen(values, batch)
+        values = self.as_seen(values, batch, context is None)
         com = estimate_com(batch)
         if start == "observed":
             com = batch.com[:, 0] if batch.com.shape[1] else np.full_like(com, np.nan)
@@ -295,9 +297,8 @@ class Imaginer(ABC):
         check_contacts(view.mask, candidates.contacts, candidates.directions, names)
         parameters = parameters_of(actions)
         belief = context if isinstance(context, Belief) else None
-        values = self.as_seen(
-            self._told(self._without(belief, context), parameters, len(actions)), candidates
-        )
+        values = self._told(self._without(belief, context), parameters, len(actions))
+        values = self.as_seen(values, candidates, context is None)
         middle = estimate_com(InteractionBatch.from_views([view]))[0] if com is None else _point(com)
         check_com(view, middle)
         if belief is not None:
@@ -323,18 +324,25 @@ class Imaginer(ABC):
         )
 
     def as_seen(
-        self, values: Float[np.ndarray, "n context"], source: InteractionBatch | Candidates
+        self,
+        values: Float[np.ndarray, "n context"],
+        source: InteractionBatch | Candidates,
+        nominal: bool = False,
     ) -> Float[np.ndarray, "n context"]:
-        """Context of actions without the bevels of objects that are seen to have none, as a lying cylinder.
+        """Context of actions without the bevels of objects that have none: a width of 0, or seen as a lying cylinder.
 
         Args:
             values: The context [SI].
             source: The views.
+            nominal: Whether these are the nominal constants: slender and thin objects then have a smaller bevel.
         """
         bevels = np.isin(self.context, BEVELS)
         if self.bevels_all or not self.marginal or not bevels.any():
             return values
-        return np.where(~level_tops(source)[:, None] & bevels, np.nan, values)
+        if nominal:
+            values = np.where(bevels, values * bevel_scales(source)[:, None], values)
+        none = ~level_tops(source) | (values[:, bevels] == 0).any(axis=1)
+        return np.where(none[:, None] & bevels, np.nan, values)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
         return self._warned(self.imagine_scenes(scenes), scenes.context, parameters)
@@ -410,7 +418,8 @@ class Imaginer(ABC):
             if belief.ranges[name] != RANGES[name]
         ]  # fmt: skip
         if idle:
-            note = f"the belief's {' and '.join(idle)} make no difference: the {self.name} is not conditioned on them"
+            verb = "makes" if len(idle) == 1 else "make"
+            note = f"the belief's {' and '.join(idle)} {verb} no difference: the {self.name} is not conditioned on them"
             warnings = tuple((*each, note) for each in warnings)
         best = futures.states[np.arange(len(futures)), futures.probability.argmax(axis=1)]
         pose = np.concatenate([best[..., :3], rotation_vector_to_quaternion(best[..., 3:])], axis=-1)

@@ -14,7 +14,7 @@ from foretrace.errors import PlanningError, check_choices, check_ranges, check_t
 from foretrace.extras import MissingExtraError
 from foretrace.geometry import Numbers, finite_array
 from foretrace.imagined import IMAGINERS, Belief, Imaginer
-from foretrace.imagined.context import Context, first_action
+from foretrace.imagined.context import Context, first_action, told_of
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
@@ -143,6 +143,8 @@ def plan(
         )
     if config.check and checker is None and own.action is first_action() and not learns:
         second = _twin(scene.object)
+    if context is None and scene.object is not None:
+        context = told_of(scene.object, *(each.context for each in (own, second) if each is not None))
     return Search(scene, aim, own, second, context, config, reach).run(T_table_object)
 
 

@@ -16,7 +16,7 @@ from foretrace.features import Precision
 from foretrace.files import as_path
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer, Scenes, Start
 from foretrace.imagined.context import CONSTANTS
-from foretrace.imagined.domain import Ranges, find_unusual
+from foretrace.imagined.domain import Ranges, find_unusual, measure_context
 from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.record import Outcome
 from foretrace.predictor.config import PredictorConfig
@@ -296,7 +296,8 @@ class EffectPredictor(Imaginer, nn.Module):
         imagined = self.imagine_effects(features, scenes.com, scenes.observed, scenes.start)
         if not self.ranges:
             return imagined
-        unusual = find_unusual(scenes.measure() | self.features.measure(inputs), self.ranges)
+        told = measure_context(self.context, scenes.context)
+        unusual = find_unusual(scenes.measure() | self.features.measure(inputs) | told, self.ranges)
         return ImaginedBatch(imagined.times, imagined.com, imagined.pose, imagined.futures, unusual)
 
     @final

@@ -153,8 +153,8 @@ class PredictorConfig:
     feature_options: dict[str, Option] = field(default_factory=dict)
     """Settings of the feature extractor, by name."""
     context: tuple[str, ...] = ()
-    """Conditioning variables beside the view: friction, tool_friction, density, contact_error; parameters of the
-    action's path."""
+    """Conditioning variables beside the view: friction, tool_friction, density, contact_error, bevel_width,
+    bevel_height; parameters of the action's path."""
     hidden_share: float = 0.0
     """Share of the lever-ups of which training hides constants of the context: of half of them all, of the others some.
     The predictor can then do without any. 0: all must be told."""

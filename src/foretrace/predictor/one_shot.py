@@ -455,8 +455,10 @@ class OneShotPredictor(EffectPredictor):
 
     def start_spread(self, features: Float[Tensor, "batch inputs"]) -> Float[Tensor, " batch"]:
         """Expected distances of centres of mass that were estimated from views (root mean square) [m]."""
-        own = self.start_error[STARTS.index("estimated")]
-        return (pixel_error(self._corners(features)).square() + own.square()).sqrt()
+        own = (
+            1e3 * self.start_error[STARTS.index("estimated")]
+        )  # in mm, whose square does not vanish beside the other
+        return ((1e3 * pixel_error(self._corners(features))).square() + own.square()).sqrt() / 1e3
 
     def _outputs(self, features: Float[Tensor, "batch inputs"], edges: PivotEdges) -> Outputs:
         values = (edges.values - self.value_mean) / self.value_scale

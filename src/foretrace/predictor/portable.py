@@ -14,7 +14,7 @@ from foretrace.files import as_path
 from foretrace.geometry import rotation_vector_to_quaternion
 from foretrace.imagined import STARTS, Futures, ImaginedBatch, Imaginer, Scenes
 from foretrace.imagined.context import CONSTANTS
-from foretrace.imagined.domain import find_unusual, known_ranges
+from foretrace.imagined.domain import find_unusual, known_ranges, measure_context
 from foretrace.interactions.batch import Candidates, InteractionBatch
 from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT, coarse_heights, hull_rows
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
@@ -114,7 +114,8 @@ class OnnxPredictor(Imaginer):
         pose = np.concatenate([best[..., :3], rotation_vector_to_quaternion(best[..., 3:])], axis=-1)
         corners = features[:, : 2 * MAX_CORNERS].reshape(len(features), -1, 2)
         count = 1 + (corners[:, 1:] != corners[:, :1]).any(axis=2).sum(axis=1)
-        unusual = find_unusual(scenes.measure() | {"corners": count.astype(float)}, self.ranges)
+        told = measure_context(self.context, scenes.context)
+        unusual = find_unusual(scenes.measure() | {"corners": count.astype(float)} | told, self.ranges)
         return ImaginedBatch(self._times, best[..., :3], pose, futures, unusual)
 
     def _futures(self, features: Float[np.ndarray, "batch inputs"], scenes: Scenes) -> Futures:

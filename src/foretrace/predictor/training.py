@@ -16,7 +16,7 @@ from foretrace.errors import TrainingError, check_type, shown
 from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
 from foretrace.files import as_path, short_hash
-from foretrace.imagined.domain import ranges_of
+from foretrace.imagined.domain import measure_context, ranges_of
 from foretrace.interactions.dataset import Dataset, InteractionBatch, count_outcomes
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import Split
@@ -264,7 +264,8 @@ class _Training:
             other_effects = effects_of(self.validation, self.predictor)
             self.predictor.finish(features, self.effects, other_features, other_effects)
         self.keeper.finish(self.predictor)
-        self.predictor.ranges = ranges_of(self.train.measures)
+        told = measure_context(self.predictor.context, self.train.context)
+        self.predictor.ranges = ranges_of(self.train.measures | told)
         return done
 
     def _fit_features(self, report: Callable[[str], None]) -> None:

@@ -18,6 +18,7 @@ import foretrace
 from foretrace.errors import ForetraceError, StudioError
 from foretrace.geometry import transform_points
 from foretrace.imagined import Belief, ImaginedEffect
+from foretrace.imagined.context import told_of
 from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import Monitor, Verdict
 from foretrace.objects import ObjectModel, Prism
@@ -262,6 +263,7 @@ def imagine(obj: ObjectModel, place: ActionBody, context: Any) -> ImaginedEffect
     """
     action = place.make(obj)
     com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
+    context = told_of(obj, learned().context) if context is None else context
     return learned().imagine(TopDownView.of(obj, action), action, context=context, com=com)
 
 

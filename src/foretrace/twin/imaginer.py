@@ -175,7 +175,8 @@ class TwinImaginer(Imaginer):
         objects = self._see(scenes)
         worlds: list[World] = []
         counts: list[int] = []
-        for row, seen in enumerate(objects):
+        for row, found in enumerate(objects):
+            seen = objects[row] = self._rimmed(scenes, row, found)
             mine = self._worlds(scenes, row, seen)
             counts.append(len(mine))
             worlds += mine
@@ -280,8 +281,6 @@ class TwinImaginer(Imaginer):
         physics = Physics(**{name: values[name] for name in told if name in Physics.__dataclass_fields__})
         if self.object is not None or not isinstance(seen.model, Prism):  # it has its own bevel, or none
             told |= {*BEVELS}
-        elif told >= {*BEVELS}:
-            seen = replace(seen, model=_bevelled(seen.model, *(values[name] for name in BEVELS)))
         model = self._weighted(seen, scenes.com[row], physics.density)
         world = World(model, seen.T_action_object, self._action(scenes, row, values), physics)
         unsure = [name for name in CONSTANTS if name not in told]
@@ -295,6 +294,26 @@ class TwinImaginer(Imaginer):
         if self.object is not None:
             told.add("thickness_factor")
         return [vary(world, tuple(told), self.config.ranges, noise, each) for each in shares]
+
+    def _rimmed(self, scenes: Scenes, row: int, seen: SeenObject) -> SeenObject:
+        """The object with the bevel that is told; where it bears no such one, with its own, and a note."""
+        model = seen.model
+        if self.object is not None or not isinstance(model, Prism):
+            return seen
+        width, height = (float(scenes.context[row, self.context.index(name)]) for name in BEVELS)
+        width = model.bevel.width if np.isnan(width) else width
+        height = model.bevel.height if np.isnan(height) else height
+        if (width, height) == (BEVEL.width, BEVEL.height):  # the usual one, as it fits the object
+            return seen
+        try:
+            return replace(seen, model=Prism(model.corners, model.height, Bevel(width, height)))
+        except ShapeError:
+            own = model.bevel
+            note = (
+                f"a bevel of {1e3 * width:.3g} x {1e3 * height:.3g} mm does not fit the object: it is simulated with "
+                f"one of {1e3 * own.width:.3g} x {1e3 * own.height:.3g} mm"
+            )
+            return replace(seen, notes=(*seen.notes, note))
 
     def _weighted(self, seen: SeenObject, com: Float[np.ndarray, "3"], density: float) -> ObjectModel:
         """The object with its centre of mass where it is known to be, if that is not where it would be anyway."""
@@ -326,13 +345,3 @@ class TwinImaginer(Imaginer):
 def _path(settings: dict[str, float]) -> ToolPath:
     """The nominal path with other parameters: bit for bit the nominal one where they are nominal."""
     return NOMINAL if settings == NOMINAL.parameters() else ToolPath.of(**settings)
-
-
-def _bevelled(model: Prism, width: float, height: float) -> Prism:
-    """A prism with another bevel; where the object bears no such one, and at the nominal one, with that which fits."""
-    if (width, height) == (BEVEL.width, BEVEL.height):
-        return model
-    try:
-        return Prism(model.corners, model.height, Bevel(width, height))
-    except ShapeError:
-        return model
