@@ -94,7 +94,7 @@ def test_a_bevel_is_believed_in_as_all_else():
     assert "bevel_height" in repr(open_)
     assert 0.0005 < np.ptp(ft.Belief().sample(50)["bevel_height"]) < 0.0012
     note = Slider().imagine(VIEW, ACTION, context=open_).warnings
-    assert any("bevel_height make no difference" in line for line in note)
+    assert any("bevel_height makes no difference" in line for line in note)
 
 
 def test_an_exact_imaginer_has_the_last_word():

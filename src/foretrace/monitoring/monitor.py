@@ -309,6 +309,10 @@ class Monitor:
             cause, causes, message = self._fixed_cause, {self._fixed_cause: 1.0}, self._note
         elif alarm:
             causes = self._causes.probabilities(self.evidence())
+            if (
+                not self._repeats and (others := 1.0 - causes.pop(FROZEN, 0.0)) > 0
+            ):  # a pose that changes is not frozen
+                causes = {name: chance / others for name, chance in causes.items()}
             likeliest = max(causes, key=lambda name: causes[name])
             cause = likeliest if causes[likeliest] >= SURE else UNKNOWN
             message = f"not as imagined: {cause}"
