@@ -208,5 +208,5 @@ def test_its_most_informative_lever_up_narrows_the_posterior_more():
             motion = ft.ObservedMotion(seen.times, seen.pose_trajectory)
             own.append(ft.identify(view, actions[k], motion, TABLE, imaginer=predictor).std["friction"])
         spread.append(np.mean(own))
-    assert found.max() > found.min() + 0.05
+    assert found.max() > found.min() + 0.1
     assert spread[0] < spread[1]

@@ -26,38 +26,26 @@ MARGIN = 0.25
 """An object is unusual if it is further outside than this share of the range."""
 LEAST_MARGIN = 0.1
 """The same as a share of the range's upper end, for measures that hardly differ in the training part."""
-MEASURES = {
+SEEN = {
     "area": (1e4, "cm^2"),
     "length": (100.0, "cm"),
     "width": (100.0, "cm"),
     "height": (100.0, "cm"),
     "distance": (100.0, "cm"),
     "corners": (1.0, ""),
-    "friction": (1.0, ""),
-    "tool_friction": (1.0, ""),
+}
+"""Measures by which objects are compared: factor from SI units to the unit of messages, and that unit. Length and width
+are along and across the action, the distance is that from contact to centre of mass in the plane."""
+TOLD = dict.fromkeys(("friction", "tool_friction", "speed"), (1.0, "")) | {
     "density": (1.0, "kg/m^3"),
     "bevel_width": (1e3, "mm"),
     "bevel_height": (1e3, "mm"),
     "insertion": (100.0, "cm"),
     "arc_radius": (100.0, "cm"),
     "sweep": (180.0 / np.pi, "degrees"),
-    "speed": (1.0, ""),
 }
-"""Measures by which objects, and what is told of them, are compared: factor from SI units to the unit of messages, and
-that unit. Length and width are along and across the action, the distance is that from contact to centre of mass in the
-plane."""
-TOLD = (
-    "friction",
-    "tool_friction",
-    "density",
-    "bevel_width",
-    "bevel_height",
-    "insertion",
-    "arc_radius",
-    "sweep",
-    "speed",
-)
-"""Those of the context."""
+"""The same for what imaginers are told."""
+MEASURES = SEEN | TOLD
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper end of measures in a training part, by name [SI]."""
@@ -266,7 +254,7 @@ def _along(
 def measure(
     batch: InteractionBatch, com: Float[np.ndarray, "batch 3"]
 ) -> dict[str, Float[np.ndarray, " batch"]]:
-    """Measures by which objects are compared [SI], by the names of ``MEASURES``.
+    """Measures by which objects are compared [SI], by the names of ``SEEN``.
 
     Args:
         batch: The objects as seen from above.
