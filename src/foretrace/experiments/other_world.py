@@ -24,9 +24,9 @@ from foretrace.evaluation.metrics import METRICS
 from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval
 from foretrace.experiments import SUMMARIES
+from foretrace.experiments.kept_motions import imagine_once, rows_of
 from foretrace.experiments.training import Recipe, load_levered
-from foretrace.files import atomic_path
-from foretrace.imagined import Futures, ImaginedBatch
+from foretrace.imagined import ImaginedBatch
 from foretrace.imagined.context import CONSTANTS
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
@@ -129,12 +129,12 @@ class OtherWorld(Experiment):
             twin, imagined = self._imagined(trial.method, folder)
             com = imagined.com[split.test]
             if trial.lever_ups:
-                learned, other = (_rows(imagined, rows) for rows in (split.train, split.validation))
+                learned, other = (rows_of(imagined, rows) for rows in (split.train, split.validation))
                 config = replace(self.residual, seed=trial.seed)
                 residual = train_residual(
                     batch[split.train], batch[split.validation], twin, config, imagined=(learned, other)
                 )
-                com = residual.correct(test, test.com[:, 0], _rows(imagined, split.test)).com
+                com = residual.correct(test, test.com[:, 0], rows_of(imagined, split.test)).com
         truth = np.where(valid_samples(test)[..., None], test.com, np.nan)
         rows: list[Row] = []
         for metric, distance in METRICS.items():
@@ -242,16 +242,7 @@ class OtherWorld(Experiment):
             batch = replace(batch, parameters=batch.parameters | told)
         if method not in self._known:
             file = kept_folder(folder, PRIORS) / f"{method.split(', ')[1]}-{fingerprint(batch)[:12]}.npz"
-            if not file.is_file():
-                futures = twin.imagine_batch(batch).futures
-                with atomic_path(file) as partial, partial.open("wb") as stream:
-                    np.savez_compressed(
-                        stream,
-                        probability=futures.probability,
-                        states=futures.states,
-                        support_points=futures.support_points,
-                    )
-            self._known[method] = _read(file, twin)
+            self._known[method] = imagine_once(twin, batch, file)
         return twin, self._known[method]
 
     @cached_property
@@ -266,25 +257,3 @@ class OtherWorld(Experiment):
     @cached_property
     def _recipe(self) -> Recipe:
         return self.recipe or Recipe.of("one-shot")
-
-
-def _read(file: Path, twin: TwinImaginer) -> ImaginedBatch:
-    """What a twin has imagined, from a file."""
-    with np.load(file) as content:
-        probability, states, support = (content[name] for name in ("probability", "states", "support_points"))
-    plain = Futures.point(states[:, 0, :, :3], states[:, 0, :, 3:], "levered")
-    futures = replace(
-        plain,
-        outcome=twin.outcomes,
-        probability=probability,
-        states=states,
-        spread=np.full(states.shape[:3], np.nan),
-        support_points=support,
-    )
-    best = states[np.arange(len(states)), probability.argmax(axis=1)]
-    return ImaginedBatch(twin.sample_times, best[..., :3], None, futures)
-
-
-def _rows(imagined: ImaginedBatch, rows: np.ndarray) -> ImaginedBatch:
-    """Some rows of what was imagined."""
-    return replace(imagined, com=imagined.com[rows], pose=None, futures=imagined.futures[rows], warnings=())

@@ -2,7 +2,8 @@
 
 Truths are simulations of the whole arm, but for part ``bullet``: there another engine moves the blade alone. Errors are
 those of the centre of mass up to where an object slips off the blade. Constants are told to the twin: they are nominal.
-The direct predictor is trained on the same split; for silhouettes and for ``bullet``, on that of part ``shuffled``.
+The direct predictor is trained on the same split, as is the residual, over the twin of the blade alone; for silhouettes
+and for ``bullet``, on that of part ``shuffled``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,12 +20,13 @@ from matplotlib.ticker import FormatStrFormatter
 from tyro.conf import Fixed, Suppress
 
 from foretrace.errors import ResultsError, ViewError
-from foretrace.evaluation.charts import GREEN, ORANGE, SKY, VERMILLION, finish, grid
+from foretrace.evaluation.charts import GREEN, ORANGE, PURPLE, SKY, VERMILLION, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, chosen, kept_folder
 from foretrace.evaluation.metrics import METRICS
 from foretrace.evaluation.statistics import interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval, number
 from foretrace.experiments import SUMMARIES
+from foretrace.experiments.kept_motions import imagine_once, rows_of
 from foretrace.experiments.paper_comparisons import CORNERS
 from foretrace.experiments.training import Recipe, load_levered
 from foretrace.experiments.transfer_objects import read_silhouettes
@@ -35,10 +37,12 @@ from foretrace.interactions.splits import PAPER_SIZES, Split, split_by_corner_co
 from foretrace.objects import Box, Cylinder
 from foretrace.pictures.style import INK, new_figure, styled
 from foretrace.predictor import load_predictor
-from foretrace.predictor.run_folder import processor_independent_fingerprint
+from foretrace.predictor.run_folder import fingerprint, processor_independent_fingerprint
 from foretrace.predictor.states import valid_lengths, valid_samples
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.twin import TwinConfig, TwinImaginer
+from foretrace.twin.residual import train_residual
+from foretrace.twin.residual_network import ResidualConfig
 
 PARTS = {
     "shuffled": "paper, shuffled",
@@ -48,7 +52,13 @@ PARTS = {
     "bullet": "Bullet",
 }
 """What imaginers are compared on, in words."""
-IMAGINERS = {"twin": GREEN, "twin, arm": VERMILLION, "twin in Bullet": ORANGE, "one-shot": SKY}
+IMAGINERS = {
+    "twin": GREEN,
+    "twin, arm": VERMILLION,
+    "twin in Bullet": ORANGE,
+    "residual": PURPLE,
+    "one-shot": SKY,
+}
 """What is compared, with its colour."""
 TWINS: dict[str, tuple[str, str]] = {
     "twin": ("mujoco", "tool"),
@@ -61,8 +71,8 @@ STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
     "median": np.median,
     "p95": lambda values: np.percentile(values, 95),
 }
-KEPT = "trainings"
-"""Folder of the trainings within the results."""
+KEPT, PRIORS = "trainings", "priors"
+"""Folders within the results: the trainings, and the motions of twins that residuals learn from."""
 CM = 100.0
 
 
@@ -135,7 +145,9 @@ class Twin(Experiment):
             if there.get(part, self.data) is not None
             for imaginer in imaginers
             # The arm exists in MuJoCo alone, and Bullet is compared where it is the truth.
+            # Residuals learn from levered objects.
             if {"twin in Bullet": part == "bullet", "twin, arm": part != "bullet"}.get(imaginer, True)
+            and (imaginer, part) != ("residual", "not-flat")
             for seed in checked_seeds(self.seeds)
         ]
 
@@ -272,12 +284,25 @@ class Twin(Experiment):
             nominal = TwinImaginer().sample_times[-1]
             watched = max(0.0, float(task.test.times[-1]) - float(nominal))
             return TwinImaginer(engine, TwinConfig(embodiment=embodiment, watch_time=watched, workers=1))
+        if trial.imaginer == "residual":
+            return self._residual(trial, task, folder)
         same = "shuffled" if trial.part in ("silhouettes", "bullet") else trial.part
         out = kept_folder(folder, KEPT) / f"{same.replace('&', '-')}-{trial.seed}"
         recipe = self._recipe(same, trial.seed)
         if trial.part == "not-flat":
             recipe = recipe.change(outcomes=tuple(np.unique(task.batch.outcome).tolist()))
         return load_predictor(recipe.train(task.batch, task.split, out))
+
+    def _residual(self, trial: TwinTrial, task: Task, folder: Path) -> Imaginer:
+        """A residual over the twin of the blade alone, learned from the training part."""
+        twin = TwinImaginer(config=TwinConfig(workers=1))
+        file = kept_folder(folder, PRIORS) / f"{fingerprint(task.batch)[:12]}.npz"
+        imagined = imagine_once(twin, task.batch, file)
+        parts = (task.split.train, task.split.validation)
+        learned, other = (rows_of(imagined, rows) for rows in parts)
+        batch, validation = (task.batch[rows] for rows in parts)
+        config = ResidualConfig(seed=trial.seed)
+        return train_residual(batch, validation, twin, config, imagined=(learned, other))
 
     def _recipe(self, part: str, seed: int) -> Recipe:
         recipe = self.recipe or Recipe.of("one-shot")
