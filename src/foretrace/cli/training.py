@@ -20,8 +20,10 @@ from foretrace.files import write_text
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import PAPER_SIZES
-from foretrace.predictor import PREDICTORS, PredictorConfig, TrainConfig
-from foretrace.predictor.config import feature_option
+from foretrace.predictor import PREDICTORS, EffectPredictor, PredictorConfig, TrainConfig
+from foretrace.predictor.checkpoint import read_config, read_predictor
+from foretrace.predictor.config import FINE_TUNING, feature_option
+from foretrace.predictor.loading import default_checkpoint
 from foretrace.predictor.model_card import RECALIBRATED, model_card, recalibration_section
 from foretrace.predictor.recalibration import SHOWN_LEVELS
 from foretrace.predictor.run_folder import RunFolder, first_of
@@ -29,6 +31,8 @@ from foretrace.urls import Url, as_place
 from foretrace.workers import ProgressReport, count_workers, on_cluster, run_jobs
 
 CARD = "MODEL_CARD.md"
+DEFAULT = "default"
+"""Stands for the predictor that comes with foretrace."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +73,13 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
     Raises:
         TrainingError: There is no such predictor, or there are no such features.
     """
-    label = _value("--predictor", words) or "lstm"
+    initial = _value("--initial", words)
+    begun = None if initial is None else read_config(folder_of(initial))
+    label = begun["predictor"] if begun else _value("--predictor", words) or "lstm"
     config_class = PREDICTORS.find(label).config_class
     settings = [each.name for each in fields(config_class)]
     features = FEATURES.find(_value("--features", words) or config_class().features)
+    recommended = FINE_TUNING if begun else config_class.training
     shared = [each.name for each in fields(TrainConfig) if each.name in settings]
 
     @adapt((config_class, ("feature_options",)), (TrainConfig, ("split", *shared)))
@@ -82,8 +89,9 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         out: Path,
         config: Any,
         extractor: Any,
-        training: Any = config_class.training,
+        training: Any = recommended,
         predictor: str = "lstm",
+        initial: str | None = None,
         split: tuple[int, int, int] | None = None,
         fresh: bool = False,
         card: bool = False,
@@ -94,15 +102,22 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         place = as_place(data, DatasetError)
         named = {word.partition("=")[0] for word in words if word.startswith("--")}
         several.check(named)
+        if initial is not None:
+            fixed = ["predictor", *settings, *(each.name for each in fields(extractor))]
+            options = [f"--{name.replace('_', '-')}" for name in fixed]
+            if given_twice := [name for name in options if {name, f"--no-{name[2:]}"} & named]:
+                raise TrainingError(
+                    f"{given_twice[0]} and --initial do not go together: the predictor stays as {initial} has it"
+                )
         folders = [out]
         if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
             if "--epochs" in named and "--min-steps" not in named:
                 training = replace(training, min_steps=1)  # who asks for one epoch gets one
-            config = replace(config, feature_options=given)
+            start = replace(config, feature_options=given) if initial is None else folder_of(initial)
             if several.seeds:
-                folders = _train_seeds(place, out, config, training, split, fresh, several)
+                folders = _train_seeds(place, out, start, training, split, fresh, several)
             else:
-                _train(place, out, config, training, split, fresh)
+                _train(place, out, start, training, split, fresh)
         for folder in folders if card else ():
             write_text(folder / CARD, model_card(folder, place))
             print(folder / CARD)
@@ -119,6 +134,8 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
         extractor: Settings of the features {features.label}; those of the predictor's --features are listed.
         training: Settings of the training loop.
         predictor: Kind of predictor: {", ".join(PREDICTORS)}.
+        initial: Fine-tune a trained predictor: the folder of its training, or `default` for the one that comes with
+            foretrace. Its settings stay.
         split: Sizes of the training, validation and test parts; by default the paper's 1400 100 300, or in the same
             proportions where there are fewer interactions.
         fresh: Discard the training in the folder instead of continuing it.
@@ -179,6 +196,11 @@ def feature_settings(features: type[FeatureExtractor], config_class: type[Predic
     return make_dataclass("FeatureSettings", settings, frozen=True)
 
 
+def folder_of(initial: str) -> Path:
+    """Folder of the predictor that a training starts from."""
+    return default_checkpoint() if initial == DEFAULT else Path(initial)
+
+
 def _value(option: str, words: Sequence[str]) -> str | None:
     """The last value of an option that is written ``--option value`` or ``--option=value``."""
     value = None
@@ -192,22 +214,22 @@ def _value(option: str, words: Sequence[str]) -> str | None:
 def _train(
     data: Path | Url,
     out: Path,
-    config: PredictorConfig,
+    start: PredictorConfig | Path,
     training: TrainConfig,
     split: tuple[int, int, int] | None,
     fresh: bool,
 ) -> None:
-    """Train one predictor."""
+    """Train one predictor, from its settings or from the folder of one that was trained before."""
     training = replace(training, first=_first(data, [out], training, fresh))
     with when_interrupted(f"the best model so far is in {out}, the same command goes on from there"):
-        _train_one(data, config, split, fresh, True, (out, training))
+        _train_one(data, start, split, fresh, True, (out, training))
     print(f"predictor: {out}")
 
 
 def _train_seeds(
     data: Path | Url,
     out: Path,
-    config: PredictorConfig,
+    start: PredictorConfig | Path,
     training: TrainConfig,
     split: tuple[int, int, int] | None,
     fresh: bool,
@@ -222,7 +244,7 @@ def _train_seeds(
     jobs = [
         (folder, replace(training, seed=seed)) for folder, seed in zip(folders, several.seeds, strict=True)
     ]
-    function = partial(_train_one, data, config, split, fresh, False)
+    function = partial(_train_one, data, start, split, fresh, False)
     with (
         when_interrupted(f"the best models so far are in {out}, the same command goes on from there"),
         on_cluster(several.cluster),
@@ -238,7 +260,7 @@ def _train_seeds(
 
 def _train_one(
     data: Path | Url,
-    config: PredictorConfig,
+    start: PredictorConfig | Path,
     split: tuple[int, int, int] | None,
     fresh: bool,
     progress: bool,
@@ -246,6 +268,8 @@ def _train_one(
 ) -> Path:
     """Train into a folder, in any process; the folder."""
     out, training = job
+    predictor = read_predictor(start) if isinstance(start, Path) else start
+    config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
     outcomes = training.outcomes or getattr(config, "outcomes", None) or (str(Outcome.LEVERED),)
     everything = cast(Dataset, first_of(_open(data), training.first))
     # Without any of them the training itself says which outcomes there are.
@@ -253,7 +277,7 @@ def _train_one(
     if split is None:
         split = PAPER_SIZES if len(dataset) >= sum(PAPER_SIZES) else None
     training = replace(training, split=split)
-    return learned.train_predictor(dataset, config, out, training, resume=not fresh, progress=progress)
+    return learned.train_predictor(dataset, predictor, out, training, resume=not fresh, progress=progress)
 
 
 def _open(data: Path | Url) -> Dataset:

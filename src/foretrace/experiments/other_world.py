@@ -1,9 +1,10 @@
 """How many real lever-ups a predictor needs in a world that is not the simulator's.
 
 Truth is a data set from another engine, with other frictions than the nominal ones. Learned from few of its lever-ups:
-the direct trajectory predictor alone, and residuals over a twin, which simulates what it sees in its own engine; the
-twin is told the nominal frictions, or those of the other world. A hundred lever-ups more decide the widths of regions,
-which errors do not depend on.
+the direct trajectory predictor alone; the predictor that comes with foretrace, fine-tuned, which has learned from
+simulations and is told the frictions of the other world; and residuals over a twin, which simulates what it sees in its
+own engine, told the nominal frictions or those of the other world. A hundred lever-ups more decide the widths of
+regions, which errors do not depend on.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,20 +19,24 @@ from matplotlib.figure import Figure
 from tyro.conf import Fixed, Suppress
 
 from foretrace.errors import ResultsError
-from foretrace.evaluation.charts import GREEN, ORANGE, SKY, finish, grid
+from foretrace.evaluation.charts import GREEN, ORANGE, PURPLE, SKY, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, chosen, kept_folder
 from foretrace.evaluation.metrics import METRICS
 from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.kept_motions import imagine_once, rows_of
-from foretrace.experiments.training import Recipe, load_levered
+from foretrace.experiments.training import Recipe, load_levered, weights_of
 from foretrace.imagined import ImaginedBatch
 from foretrace.imagined.context import CONSTANTS
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Physics
 from foretrace.interactions.splits import PAPER_SIZES, Split, scaled_sizes
 from foretrace.pictures.style import new_figure, styled
+from foretrace.predictor import fit_predictor
+from foretrace.predictor.checkpoint import read_predictor
+from foretrace.predictor.config import FINE_TUNING
+from foretrace.predictor.loading import default_checkpoint
 from foretrace.predictor.run_folder import fingerprint, processor_independent_fingerprint
 from foretrace.predictor.states import valid_samples
 from foretrace.twin import TwinConfig, TwinImaginer
@@ -40,12 +45,14 @@ from foretrace.twin.residual_network import ResidualConfig
 
 METHODS = {
     "learned alone": SKY,
+    "fine-tuned": PURPLE,
     "residual, nominal": ORANGE,
     "residual, told": GREEN,
 }
-"""What is compared, with its colour. With no lever-up, a residual is its twin."""
+"""What is compared, with its colour. With no lever-up, a residual is its twin, and what is fine-tuned is as it was."""
 WORDS = {
     "learned alone": "direct predictor alone",
+    "fine-tuned": "predictor that comes with foretrace, told the frictions, fine-tuned",
     "residual, nominal": "residual over the twin, nominal frictions",
     "residual, told": "residual over the twin, told the frictions",
 }
@@ -116,6 +123,7 @@ class OtherWorld(Experiment):
             return None
         own = {name: value for name, value in vars(self.residual).items() if name != "seed"}
         recipe = {"predictor": self._recipe.describe(), "residual": own, "proportional": self.proportional}
+        recipe["initial"] = weights_of(None)
         return {"data": processor_independent_fingerprint(self._levered), "recipe": recipe}
 
     def run(self, trial: OtherWorldTrial, folder: Path) -> Sequence[Row]:
@@ -125,6 +133,11 @@ class OtherWorld(Experiment):
         if trial.method == "learned alone":
             predictor, _ = self._recipe.change(seed=trial.seed).fit(batch, split)
             com = predictor.imagine_batch(test).com
+        elif trial.method == "fine-tuned":
+            predictor = read_predictor(default_checkpoint())
+            if trial.lever_ups:
+                predictor, _ = fit_predictor(batch, predictor, split, replace(FINE_TUNING, seed=trial.seed))
+            com = predictor.imagine_batch(test, context="recorded").com[:, : test.com.shape[1]]
         else:
             twin, imagined = self._imagined(trial.method, folder)
             com = imagined.com[split.test]

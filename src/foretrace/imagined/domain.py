@@ -375,6 +375,15 @@ def ranges_of(measures: Mapping[str, Float[np.ndarray, " batch"]]) -> dict[str, 
     }
 
 
+def wider(first: Ranges, second: Ranges) -> dict[str, tuple[float, float]]:
+    """Ranges that hold those of both."""
+    both = {**first, **second}
+    return {
+        name: (min(low, first.get(name, (low,))[0]), max(high, first.get(name, (high,))[-1]))
+        for name, (low, high) in both.items()
+    }
+
+
 def known_ranges(found: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
     """Those ranges in a configuration file that this foretrace has measures for."""
     return {name: (float(low), float(high)) for name, (low, high) in found.items() if name in MEASURES}

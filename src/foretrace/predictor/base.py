@@ -106,6 +106,8 @@ class EffectPredictor(Imaginer, nn.Module):
         """What it predicts."""
         self.learned_from: tuple[str, ...] = (str(Outcome.LEVERED),)
         """Outcomes of its training part."""
+        self.fine_tuned = False
+        """Whether it is being trained although it was trained before."""
         self.ranges: Ranges = {}
         """Range of each of `foretrace.imagined.domain.MEASURES` in the training part; empty if unknown."""
         self.register_buffer("state_mean", torch.zeros(state_size(state)))
@@ -279,6 +281,12 @@ class EffectPredictor(Imaginer, nn.Module):
 
     @final
     @property
+    def is_trained(self) -> bool:
+        """Whether a training has begun: the times of samples come from its data."""
+        return bool(self.times.any())
+
+    @final
+    @property
     def device(self) -> torch.device:
         """Where the predictor's tensors are."""
         return self.state_mean.device
@@ -302,8 +310,12 @@ class EffectPredictor(Imaginer, nn.Module):
 
     @final
     def encode(self, batch: InteractionBatch) -> Float[np.ndarray, "batch time state"]:
-        """States of trajectories in the action frame [m], zeros past their lengths."""
-        return encode_states(batch, self.state, self.lengths(batch))
+        """States of trajectories in the action frame [m], zeros past their lengths.
+
+        Of actions that were observed for a shorter time than the predictor imagines, the last samples are such zeros.
+        """
+        states = encode_states(batch, self.state, self.lengths(batch))
+        return np.pad(states, ((0, 0), (0, self.num_samples - states.shape[1]), (0, 0)))
 
     @final
     def number_outcomes(self, batch: InteractionBatch) -> Int[np.ndarray, " batch"]:

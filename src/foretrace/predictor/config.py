@@ -137,6 +137,10 @@ class TrainConfig:
         return max(self.epochs, math.ceil(self.min_steps / math.ceil(size / self.batch_size)))
 
 
+FINE_TUNING = TrainConfig(epochs=40, learning_rate=1e-3)
+"""Recommended settings for a predictor that was trained before, whatever it is."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PredictorConfig:
     """Settings that every predictor has; a subclass beside each predictor class adds its own."""

@@ -289,7 +289,21 @@ class OneShotPredictor(EffectPredictor):
         other_features: Float[Tensor, "other inputs"],
         other_effects: Effects,
     ) -> None:
-        """Estimate the covariance of normalised residuals, and the widths of prediction regions (split-conformal)."""
+        """Estimate the covariance of normalised residuals, and the widths of prediction regions (split-conformal).
+
+        A predictor that was trained before keeps its covariance: few actions tell little about it.
+        """
+        if not self.fine_tuned:
+            self._fit_covariance(features, effects, other_features, other_effects)
+        self.calibrate(other_features, other_effects)
+
+    def _fit_covariance(
+        self,
+        features: Float[Tensor, "batch inputs"],
+        effects: Effects,
+        other_features: Float[Tensor, "other inputs"],
+        other_effects: Effects,
+    ) -> None:
         features, effects = _some(features, effects)
         residuals, other_residuals = (
             torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
@@ -299,15 +313,15 @@ class OneShotPredictor(EffectPredictor):
             mine = residuals[effects.outcomes == outcome]
             others = other_residuals[other_effects.outcomes == outcome]
             self.covariance[outcome] = fit_covariance(mine if len(mine) else residuals, others)
-        self.calibrate(other_features, other_effects)
 
     def calibrate(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
         """Fit temperatures and quantiles to a part that the networks have not learned from."""
+        before = self.temperature.tolist()
         self.temperature.fill_(1.0)
         every = torch.ones(len(features), len(self.optional), dtype=torch.bool, device=self.device)
         inputs = [features, self.without_context(features, every)] if self.optional else [features]
         views = [piece for each in inputs for piece in _pieces(each, effects)]
-        self.temperature.copy_(fit_temperatures([self._odds(*piece) for piece in views]))
+        self.temperature.copy_(fit_temperatures([self._odds(*piece) for piece in views], before))
         uniform = effects.estimated_com.isfinite().all(dim=1)
         off = (effects.estimated_com - self._com(effects.states))[uniform].square().sum(dim=1)
         if len(off):

@@ -148,7 +148,8 @@ class RunFolder:
         Raises:
             TrainingError: The folder holds a training of another configuration.
         """
-        config = as_json(describe(predictor) | {"training": training})
+        described = describe(predictor) | {"training": training}
+        config = as_json({name: value for name, value in described.items() if name != RANGES})
         if resume and (self.path / CONFIG).is_file():
             self._check(config)
             return

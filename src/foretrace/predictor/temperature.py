@@ -12,7 +12,7 @@ from torch import Tensor
 LIMITS = (0.2, 5.0)
 """Lowest and highest temperature."""
 ENOUGH = 50
-"""Fewer observations leave a temperature at 1."""
+"""Fewer observations leave a temperature as it is."""
 
 
 class Odds(NamedTuple):
@@ -35,19 +35,25 @@ def tempered(
     return (outcome / temperature[0]).log_softmax(dim=2) + edge
 
 
-def fit_temperatures(parts: Sequence[Odds]) -> Float[Tensor, "2"]:
-    """The temperatures of least negative log-likelihood, of predictions at temperature 1."""
+def fit_temperatures(parts: Sequence[Odds], otherwise: Sequence[float] = (1.0, 1.0)) -> Float[Tensor, "2"]:
+    """The temperatures of least negative log-likelihood.
+
+    Args:
+        parts: Predictions at temperature 1, and what happened.
+        otherwise: What they are where there are fewer than `ENOUGH` observations.
+    """
     joint, outcome, edge = (torch.cat(values) for values in zip(*parts, strict=True))
     rows = torch.arange(len(joint), device=joint.device)
     outcomes = joint.logsumexp(dim=1)
     edges = (joint - outcomes[:, None])[rows, :, outcome]
     known = edge >= 0
-    return torch.tensor([_best(outcomes, outcome), _best(edges[known], edge[known])])
+    fitted = (_best(outcomes, outcome), _best(edges[known], edge[known]))
+    return torch.tensor([old if new is None else new for new, old in zip(fitted, otherwise, strict=True)])
 
 
-def _best(log_probability: Float[Tensor, "batch kinds"], observed: Int[Tensor, " batch"]) -> float:
+def _best(log_probability: Float[Tensor, "batch kinds"], observed: Int[Tensor, " batch"]) -> float | None:
     if len(observed) < ENOUGH or log_probability.shape[1] < 2:
-        return 1.0
+        return None
 
     def loss(logarithm: float) -> float:
         scaled = (log_probability / np.exp(logarithm)).log_softmax(dim=1)

@@ -16,13 +16,13 @@ from foretrace.errors import TrainingError, check_type, shown
 from foretrace.features.base import FitPart, fast_precision
 from foretrace.features.fitting import learning_rate
 from foretrace.files import as_path, short_hash
-from foretrace.imagined.domain import measure_context, ranges_of
+from foretrace.imagined.domain import measure_context, ranges_of, wider
 from foretrace.interactions.dataset import Dataset, InteractionBatch, count_outcomes
 from foretrace.interactions.record import Outcome
 from foretrace.interactions.splits import Split
 from foretrace.predictor.base import EffectPredictor
 from foretrace.predictor.checkpoint import load_tensors, read_tensors, write_tensors
-from foretrace.predictor.config import PredictorConfig, TrainConfig
+from foretrace.predictor.config import FINE_TUNING, PredictorConfig, TrainConfig
 from foretrace.predictor.display import tensorboard, terminal
 from foretrace.predictor.parts import (
     Part,
@@ -74,7 +74,8 @@ def fit_predictor(
 
     Args:
         batch: The interactions.
-        predictor: Its settings, or an untrained predictor, which is trained in place.
+        predictor: Its settings, or a predictor, which is trained in place; one that was trained before is fine-tuned,
+            see `train_predictor`.
         split: Rows of ``batch`` in each part, all with at least two valid samples.
         training: Settings of the loop, of which ``split``, ``outcomes`` and ``first`` are not looked at; by default
             those that the predictor's settings recommend.
@@ -87,11 +88,11 @@ def fit_predictor(
         The predictor of the best validation epoch, and the metrics of all epochs.
 
     Raises:
-        TrainingError: The predictor does not fit the data or was trained before, or the loss is no longer finite.
+        TrainingError: The predictor does not fit the data, or the loss is no longer finite.
     """
     training = _loop_settings(predictor, training)
     with _made(predictor, training, batch, training.threads) as made:
-        made.learned_from = _outcomes_of(batch, split)
+        made.learned_from = _learned(made, batch, split)
         inputs = made.features.inputs(batch) if inputs is None else inputs
         train, validation = (
             prepare(batch[rows], made, inputs[rows]) for rows in (split.train, split.validation)
@@ -115,9 +116,14 @@ def train_predictor(
     After every epoch all that is needed to go on is on disk: the same call continues a training that was
     killed and ends with the same model, to the bit on a CPU, as if that had never happened.
 
+    A predictor that was trained before is fine-tuned: it starts from its weights, and keeps how it normalises and what
+    else it took from its first training part; new data only widen its ranges. Interactions may be observed for a
+    shorter time than it imagines. Its regions and probabilities are fitted to the new validation part, as far as that
+    is large enough.
+
     Args:
         data: The interactions.
-        predictor: Its settings, or an untrained predictor.
+        predictor: Its settings, or a predictor, which is trained in place.
         out: Folder of the training: ``config.json``, ``model.safetensors``, ``metrics.csv``,
             ``environment.json``, ``split.json`` and TensorBoard events.
         training: Settings of the loop; by default those that the predictor's settings recommend.
@@ -130,8 +136,8 @@ def train_predictor(
         The folder.
 
     Raises:
-        TrainingError: The predictor does not fit the data or was trained before, the split is larger than the data, the
-            folder is in use, or the loss is no longer finite.
+        TrainingError: The predictor does not fit the data, the split is larger than the data, the folder is in use, or
+            the loss is no longer finite.
     """
     check_type("data", data, (InteractionBatch, Dataset), TrainingError)
     training = _loop_settings(predictor, training)
@@ -144,12 +150,14 @@ def train_predictor(
         training = replace(training, outcomes=training.outcomes or made.outcomes or (str(Outcome.LEVERED),))
         split = choose_split(source, training) if split is None else split
         check_split(split, usable_lengths(source))
-        made.learned_from = _outcomes_of(source, split)
+        made.learned_from = _learned(made, source, split)
         described = {name: value for name, value in asdict(training).items() if name not in RUNTIME}
         described |= {
             "data": fingerprint(source, made.context),
             "rows": short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()]),
         }
+        if made.fine_tuned:
+            described["initial"] = _digest(made)
         if resume and folder.finished:  # nothing is written
             folder.start(made, described, resume)
             return folder.path
@@ -222,9 +230,10 @@ class _Training:
         self.config, self.predictor, self.keeper, self.fitted = config, predictor, keeper, fitted
         self.train, self.validation = train, validation
         self.epochs = config.num_epochs(len(train))
-        mean, scale = state_statistics(train.states, train.valid, predictor.state)
-        predictor.set_normalisation(mean, scale, train.source.times)
-        predictor.set_context(train.context)
+        if not predictor.fine_tuned:
+            mean, scale = state_statistics(train.states, train.valid, predictor.state)
+            predictor.set_normalisation(mean, scale, train.source.times)
+            predictor.set_context(train.context)
         self.effects = effects_of(train, predictor, in_place=train.large)
         # The loss of a state's small change is small: the usual epsilon of 1e-8 would outweigh its gradient.
         groups = parameter_groups(predictor)
@@ -243,9 +252,10 @@ class _Training:
         done = self.keeper.restore(self.predictor, self.optimizer)
         if done is None:
             done = Progress()
-            self._fit_features(report)
-            with torch.no_grad():
-                self.predictor.prepare(self._features_of(self.train), self.effects)
+            if not self.predictor.fine_tuned:
+                self._fit_features(report)
+                with torch.no_grad():
+                    self.predictor.prepare(self._features_of(self.train), self.effects)
             self.keeper.save(done, self.predictor, self.optimizer)
         while done.epoch < self.epochs:
             started = perf_counter()
@@ -265,7 +275,7 @@ class _Training:
             self.predictor.finish(features, self.effects, other_features, other_effects)
         self.keeper.finish(self.predictor)
         told = measure_context(self.predictor.context, self.train.context)
-        self.predictor.ranges = ranges_of(self.train.measures | told)
+        self.predictor.ranges = wider(self.predictor.ranges, ranges_of(self.train.measures | told))
         return done
 
     def _fit_features(self, report: Callable[[str], None]) -> None:
@@ -358,16 +368,26 @@ def parameter_groups(predictor: EffectPredictor) -> list[dict[str, Any]]:
     return [{"params": p, "share": share, "weight_decay": decay} for (share, decay), p in groups.items()]
 
 
-def _outcomes_of(source: Source, split: Split) -> tuple[str, ...]:
-    """Outcomes that occur in the training part, in the order in which actions name them."""
-    return tuple(count_outcomes(outcome_of(source)[split.train].tolist()))
+def _learned(predictor: EffectPredictor, source: Source, split: Split) -> tuple[str, ...]:
+    """Outcomes that occur in the training part, in the order in which actions name them; and in those before."""
+    before = predictor.learned_from if predictor.fine_tuned else ()
+    return tuple(count_outcomes([*before, *outcome_of(source)[split.train].tolist()]))
+
+
+def _digest(predictor: EffectPredictor) -> str:
+    """A checksum of a predictor's tensors."""
+    tensors = predictor.state_dict().values()
+    return short_hash([tensor.cpu().contiguous().numpy().tobytes() for tensor in tensors])
 
 
 def _loop_settings(predictor: PredictorConfig | EffectPredictor, training: TrainConfig | None) -> TrainConfig:
     check_type("predictor", predictor, (PredictorConfig, EffectPredictor), TrainingError)
     check_type("training", training, (TrainConfig, type(None)), TrainingError)
-    config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
-    return config.training if training is None else training
+    if training is not None:
+        return training
+    if not isinstance(predictor, EffectPredictor):
+        return predictor.training
+    return FINE_TUNING if predictor.is_trained else predictor.config.training
 
 
 @contextmanager
@@ -377,17 +397,28 @@ def _made(
     source: Source,
     threads: int | None,
 ) -> Iterator[EffectPredictor]:
-    """The untrained predictor on its device; PyTorch's threads set, its random numbers seeded for the training."""
+    """The predictor on its device; PyTorch's threads set, its random numbers seeded for the training."""
     device, num_samples = find_device(training.device), len(source.times)
     with seeded(training.seed, 0, device), thread_count(threads):
         made = predictor if isinstance(predictor, EffectPredictor) else predictor.make(num_samples)
-        if made.num_samples != num_samples:
+        made.fine_tuned = made.is_trained
+        if made.fine_tuned:
+            _check_times(made, source)
+        elif made.num_samples != num_samples:
             raise TrainingError(
                 f"the predictor imagines {made.num_samples} samples, the data have {num_samples}: make it for these"
             )
-        if made.ranges or made.times.any():
-            raise TrainingError("the predictor was trained before: give its config, or an untrained one")
         made = made.to(device)
         made.set_precision(fast_precision(device) if training.precision == "auto" else training.precision)
         with thread_count(threads or suitable_threads(made)):
             yield made
+
+
+def _check_times(predictor: EffectPredictor, source: Source) -> None:
+    """Refuse data that a predictor cannot learn more from, as they were sampled at other times or for longer."""
+    times, own = np.round(source.times, 9), np.round(predictor.sample_times, 9)
+    if not np.array_equal(times, own[: len(times)]):
+        raise TrainingError(
+            f"the data are sampled at {shown(times.tolist())}, the predictor imagines {shown(own.tolist())}: take data "
+            f"with its period, and for at most {own[-1]:g} s"
+        )
