@@ -153,12 +153,17 @@ def test_the_command(initial, tmp_path, capsys):
         "--out",
         str(tmp_path / "run"),
     ]
-    assert main([*words, "--epochs", "2"]) == 0
+    assert main([*words, "--epochs", "2", "--card"]) == 0
     noted = json.loads((tmp_path / "run" / "config.json").read_text())
     assert noted["config"] == json.loads((initial / "config.json").read_text())["config"]
     assert noted["training"]["epochs"] == 2
     assert noted["training"]["learning_rate"] == FINE_TUNING.learning_rate
-    assert noted["training"]["initial"]
+    card = (tmp_path / "run" / "MODEL_CARD.md").read_text()
+    assert (
+        f"foretrace train --data {tmp_path / 'data'} --out {tmp_path / 'run'} --initial INITIAL --epochs 2"
+        in card
+    )
+    assert f"have the checksum `{noted['training']['initial']}`" in card
 
 
 @pytest.mark.parametrize("option", [["--hidden", "8"], ["--predictor", "lstm"], ["--features", "none"]])

@@ -187,3 +187,41 @@ def test_further_folders_of_results_are_taken_in(tmp_path):
     assert set(found.rows["experiment"]) == {"support-points"}
     with pytest.raises(ResultsError, match=r"support-points, .* is in two folders: leave one out"):
         run_experiment(Paper(results=(second, first)), first)
+
+
+def twin_results(folder: Path) -> Path:
+    """Results of twins, as `foretrace evaluate twin` leaves them."""
+    rows = [
+        (part, imaginer, seed, metric, value + 0.001 * seed)
+        for part in ("shuffled", "3&4", "silhouettes")
+        for imaginer, value in (("twin", 0.06), ("residual", 0.04), ("one-shot", 0.05))
+        for seed in range(2)
+        for metric in ("full_mean", "final_mean", "full_median")
+    ]
+    folder.mkdir()
+    pd.DataFrame(rows, columns=["part", "imaginer", "seed", "metric", "value"]).to_csv(
+        folder / ROWS, index=False
+    )
+    write_json(folder / SUMMARY, summary_content({"experiment": "twin"}, {}))
+    return folder
+
+
+def test_twins_stand_beside_the_predictors_in_figures_and_change_no_claim(table, tmp_path):
+    folder = twin_results(tmp_path / "twin")
+    with_twins, without = Paper(twins=(folder, folder)), Paper()
+    shown = {name: words(figure).split("\n") for name, figure in with_twins.figures(table).items()}
+    for name in ("figure-10a", "figure-10b", "figure-11", "figure-13"):
+        assert "twin" in shown[name]
+        assert ("residual" in shown[name]) == (name != "figure-11")
+    assert not any("twin" in shown[name] for name in ("figure-9a", "figure-12"))
+    assert with_twins.judge(table) == without.judge(table)
+    drawn = with_twins.figures(table)["figure-13"].axes[0]
+    ends = {round(float(np.asarray(line.get_ydata())[0]), 4) for line in drawn.lines if len(line.get_ydata())}
+    assert {0.0605, 0.0405} <= ends  # the mean over both seeds, once
+
+
+def test_results_of_another_experiment_are_no_twins(table, tmp_path):
+    folder = twin_results(tmp_path / "twin")
+    table.to_csv(folder / ROWS, index=False)
+    with pytest.raises(ResultsError):
+        Paper(twins=(folder,)).figures(table)

@@ -44,6 +44,9 @@ STYLES = {
     "sp-truth": Style(GREEN, "*", SOLID),
     "sp-rule": Style(PURPLE, "h", DOTTED),
     "one-shot": Style(SKY, "p", SOLID),
+    "twin": Style(GREY, "d", DASHED),
+    "residual": Style(GREY, "X", DOTTED),
+    "twin, arm": Style(GREY, "H", SOLID),
     "chance": Style(GREY, "_", DOTTED),
 }
 """What has a style of its own: the paper's features in the order of its figures, then what the paper does not have."""
@@ -54,6 +57,7 @@ FAMILIES = {
     "supervised": ("sc-cnn", "im-cnn"),
     "task-specific": ("sp-pred", "sp-truth", "sp-rule"),
     "direct": ("one-shot",),
+    "simulated": ("twin", "residual", "twin, arm"),
     OTHER: (),
 }
 """What is drawn side by side; `OTHER` takes whatever is in none of them."""

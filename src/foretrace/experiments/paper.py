@@ -34,6 +34,7 @@ from foretrace.experiments.paper_comparisons import (
 from foretrace.experiments.paper_figures import FIGURES
 from foretrace.experiments.support_points import support_point_metrics
 from foretrace.experiments.training import BASE, Recipe, load_levered
+from foretrace.experiments.twin import rows_of_twins
 from foretrace.features import FEATURES, Option
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.splits import PAPER_SIZES
@@ -68,6 +69,9 @@ class Paper(Experiment):
     """Split in the paper's proportions instead of its 1400, 100 and 300 interactions."""
     results: tuple[Path, ...] = ()
     """Folders of further results, which claims and figures take in."""
+    twins: tuple[Path, ...] = ()
+    """Folders of results of `foretrace evaluate twin`, which the figures show beside the predictors; what
+    is in two of them counts once."""
     device: Device = "auto"
     """Where to compute."""
     recipes: Suppress[Fixed[Mapping[str, Recipe]]] = field(default_factory=dict)
@@ -159,8 +163,9 @@ class Paper(Experiment):
         return "\n\n".join(parts) + "\n"
 
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:
-        """The paper's figures 9 to 13."""
-        rows = self._with_more(rows)
+        """The paper's figures 9 to 13, with what twins imagine of the same lever-ups."""
+        simulated = [rows_of_twins(folder) for folder in self.twins]
+        rows = pd.concat([self._with_more(rows), *simulated], ignore_index=True).drop_duplicates(KEY)
         drawn = {name: draw(rows) for name, draw in FIGURES.items()}
         return {name: figure for name, figure in drawn.items() if figure is not None}
 

@@ -46,6 +46,7 @@ PANELS = {
     "Supervised": SUPERVISED,
     "Support points": (*TASK_SPECIFIC, "sp-rule"),
     "Direct": ("one-shot",),
+    "Simulated": ("twin", "twin, arm"),
 }
 """Predictors that share a panel where there is one for each family."""
 ERRORS = {"full": "error, full trajectory [cm]", "final": "error, final position [cm]"}

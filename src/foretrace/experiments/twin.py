@@ -24,10 +24,11 @@ from foretrace.evaluation.charts import GREEN, ORANGE, PURPLE, SKY, VERMILLION, 
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, chosen, kept_folder
 from foretrace.evaluation.metrics import METRICS
 from foretrace.evaluation.statistics import interval
+from foretrace.evaluation.storage import read_rows
 from foretrace.evaluation.tables import markdown_table, mean_with_interval, number
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.kept_motions import imagine_once, rows_of
-from foretrace.experiments.paper_comparisons import CORNERS
+from foretrace.experiments.paper_comparisons import CORNERS, SIZES
 from foretrace.experiments.training import Recipe, load_levered
 from foretrace.experiments.transfer_objects import read_silhouettes
 from foretrace.imagined import Imaginer
@@ -73,6 +74,8 @@ STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
 }
 KEPT, PRIORS = "trainings", "priors"
 """Folders within the results: the trainings, and the motions of twins that residuals learn from."""
+PAPER_METRICS = {"full_mean": "full", "final_mean": "final"}
+"""Errors by their names in the paper's comparisons."""
 CM = 100.0
 
 
@@ -97,6 +100,32 @@ class TwinTrial(Trial):
     """One of IMAGINERS."""
     seed: int
     """Seed of the split and of the training."""
+
+
+def rows_of_twins(folder: Path) -> pd.DataFrame:
+    """What simulates, on the paper's split and novel corner counts, in the form of results of the paper's comparisons.
+
+    A twin learns nothing, so that its error is the same whatever the size of the training part.
+
+    Args:
+        folder: Results of this experiment.
+
+    Raises:
+        ResultsError: They are missing, or of another experiment.
+    """
+    rows = read_rows(folder, TwinTrial)
+    rows = rows[rows["metric"].isin(PAPER_METRICS) & rows["imaginer"].ne("one-shot")]
+    rows = rows.assign(
+        features=rows["imaginer"], setting=rows["part"], metric=rows["metric"].map(PAPER_METRICS)
+    )
+    shuffled, novel = rows[rows["part"].eq("shuffled")], rows[rows["part"].isin(CORNERS)]
+    unlearned = shuffled[shuffled["imaginer"].isin(TWINS)]
+    parts = [
+        shuffled.assign(experiment="features"),
+        novel.assign(experiment="novel-corners"),
+        *(unlearned.assign(experiment="training-size", setting=size) for size in SIZES),
+    ]
+    return pd.concat(parts)[["experiment", "features", "seed", "setting", "metric", "value"]]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from foretrace.predictor import EffectPredictor, TrainConfig, load_predictor, pa
 from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, read_config
 from foretrace.predictor.config import feature_option
 from foretrace.predictor.recalibration import SHOWN_LEVELS
-from foretrace.predictor.run_folder import ENVIRONMENT, RunFolder
+from foretrace.predictor.run_folder import ENVIRONMENT, INITIAL, RunFolder
 from foretrace.predictor.states import valid_samples
 from foretrace.trajectories import final_distance, mean_distance
 from foretrace.urls import Url
@@ -121,8 +121,11 @@ def _training(run: Path, data: Path | Url) -> str:
     options = {name: value for name, value in content["config"].items() if value != nominal.get(name)}
     given = options.pop("feature_options", {})
     options |= {feature_option(name, type(predictor.config)): value for name, value in given.items()}
+    initial = training.get(INITIAL)
+    start = f"--predictor {predictor.label}" if initial is None else "--initial INITIAL"
+    options = options if initial is None else {}
     options |= {f.name: training[f.name] for f in fields(TrainConfig) if f.name in training}
-    command = [f"foretrace train --data {data} --out {run} --predictor {predictor.label}"]
+    command = [f"foretrace train --data {data} --out {run} {start}"]
     for name, value in options.items():
         if name in RUNTIME_OPTIONS or value is None:
             continue
@@ -132,8 +135,11 @@ def _training(run: Path, data: Path | Url) -> str:
     remedy = "give the whole folder of a training"
     environment = read_json(run / ENVIRONMENT, Environment, TrainingError, remedy)
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
+    tuned = (
+        f"The tensors of INITIAL, which it started from, have the checksum `{initial}`. " if initial else ""
+    )
     return (
-        f"```console\n$ {' '.join(command)}\n```\n\nCommit {environment['commit'] or 'unknown'}; {versions}; on "
+        f"```console\n$ {' '.join(command)}\n```\n\n{tuned}Commit {environment['commit'] or 'unknown'}; {versions}; on "
         f"{environment['device']} in {environment['precision']}. The data's fingerprint is `{training['data']}`."
     )
 

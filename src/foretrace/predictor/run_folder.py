@@ -58,6 +58,8 @@ FINGERPRINTS = "fingerprints"
 """Entry of the split with a fingerprint of each part."""
 RESUME = "resume.safetensors"
 TENSORBOARD = "tensorboard"
+INITIAL = "initial"
+"""Entry about a training in ``config.json``: a checksum of the tensors that it started from, if it did."""
 
 
 class RunSettings(TypedDict, total=False):

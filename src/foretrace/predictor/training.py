@@ -35,6 +35,7 @@ from foretrace.predictor.parts import (
     usable_lengths,
 )
 from foretrace.predictor.run_folder import (
+    INITIAL,
     TENSORBOARD,
     Progress,
     Row,
@@ -157,7 +158,7 @@ def train_predictor(
             "rows": short_hash([json.dumps([rows.tolist() for rows in asdict(split).values()]).encode()]),
         }
         if made.fine_tuned:
-            described["initial"] = _digest(made)
+            described[INITIAL] = _digest(made)
         if resume and folder.finished:  # nothing is written
             folder.start(made, described, resume)
             return folder.path
