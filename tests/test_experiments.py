@@ -92,6 +92,8 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "other-world": lambda root: {"data": root / "blade", "lever_ups": (0, 6), "seeds": (0,), "proportional": True,
                                  "recipe": QUICK["one-shot"],
                                  "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
+    "novel-families": lambda root: {"data": root / "plain", "families": ("few corners",),
+                                    "recipe": QUICK["one-shot"].change(outcomes=("levered", "slipped"))},
     "identification": lambda root: {"objects": 1, "lever_ups": 1},
     "monitoring": lambda root: {"executions": 2, "faults": 1, "successes": 2,
                                 "parts": ("calibration", "normal", "round and dented outlines", "slip", "freeze")},

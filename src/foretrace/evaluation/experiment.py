@@ -38,6 +38,7 @@ SUMMARIES = {
     "identification": "What a few lever-ups tell of an object and the table.",
     "monitoring": "The monitor on normal executions and injected faults.",
     "pushes": "Where recorded pushes leave their objects.",
+    "novel-families": "Families of objects that are new to the predictor.",
     "other-world": "Few lever-ups of another world, learned alone or over a twin.",
     "non-flat": "Masks against height maps of objects that are not flat.",
     "planning": "Plans beside simple rules and an oracle that simulates all.",

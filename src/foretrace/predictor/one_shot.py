@@ -385,6 +385,17 @@ class OneShotPredictor(EffectPredictor):
         best = futures.states[np.arange(len(com)), futures.probability.argmax(axis=1)].astype(float)
         return ImaginedBatch(self.sample_times, best[..., :3], decode_poses(best), futures)
 
+    def network_inputs(self, batch: InteractionBatch) -> Float[np.ndarray, "batch values"]:
+        """What networks are given about the action, relative to the candidate pivot edge ahead, of unit scale.
+
+        The centre of mass is the observed one. The context is left out.
+        """
+        with torch.inference_mode():
+            features = self.compute_features(self.features.inputs(batch))
+            com = torch.as_tensor(batch.com[:, 0], dtype=torch.float32, device=self.device)
+            values = self._find_edges(features, com).values[:, 0, 0]
+            return np.asarray(((values - self.value_mean) / self.value_scale).double().cpu())
+
     def traced(self) -> TracedDistribution:
         """The network from outlines to all futures."""
         return TracedDistribution(self)
