@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from foretrace.experiments.shipped import auroc, calibration_error
+from foretrace.experiments.shipped import auroc, calibration_error, draw
 from foretrace.imagined import LEVELS, Futures
 
 
@@ -39,3 +39,12 @@ def test_calibration_error_of_exaggerated_confidence():
     right = np.arange(1000) % 10 < 7
     assert calibration_error(np.full(1000, 0.7), right) == pytest.approx(0.0, abs=1e-9)
     assert calibration_error(np.full(1000, 0.95), right) == pytest.approx(0.25)
+
+
+def test_drawn_motions_follow_futures_as_often_as_they_are_probable_and_stray_by_their_spread():
+    drawn = draw(futures(0.75, 0.1, 0.002), 4000)[0]
+    second = drawn[..., 0].mean(axis=1) > 0.05
+    assert second.mean() == pytest.approx(0.25, abs=0.03)
+    off = drawn[~second]
+    assert np.sqrt((off**2).sum(axis=-1).mean()) == pytest.approx(0.002, rel=0.05)
+    assert np.allclose(off, off[:, :1])  # one offset for the whole motion

@@ -1,14 +1,15 @@
 """The predictor that comes with foretrace, and the twin, on lever-ups that nothing was trained on.
 
-Every part is simulated anew, with the blade alone and nominal physics; the seed of its objects is not that of the
-training data. Errors are those of the centre of mass over whole records. Intervals are over objects.
+Every part is simulated anew, with the blade alone and nominal physics, but for one part, whose physics and contact are
+random; the seed of its objects is not that of the training data. Errors are those of the centre of mass over whole
+records. Intervals are over objects.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import pandas as pd
@@ -24,7 +25,9 @@ from foretrace.evaluation.statistics import interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval, number
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.transfer_objects import read_silhouettes
-from foretrace.imagined import STARTS, ImaginedBatch, Imaginer, Start, conformal_scores
+from foretrace.experiments.uncertainty_metrics import score
+from foretrace.imagined import STARTS, Futures, ImaginedBatch, Imaginer, Start, conformal_scores
+from foretrace.imagined.context import UNKNOWN, Context
 from foretrace.imagined.imaginer import UNSURE
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.record import Outcome
@@ -34,12 +37,20 @@ from foretrace.predictor.loading import default_checkpoint
 from foretrace.predictor.run_folder import fingerprint
 from foretrace.simulation.collect import CollectConfig, num_trials, simulate_trial
 from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
+from foretrace.simulation.randomisation import NOTHING, RANDOMISED, Randomisation
 from foretrace.twin import TwinImaginer
 
-PARTS = {"polygons": "paper", "boxes and cylinders": "solids", "silhouettes": ""}
+RANDOM = "polygons, random physics"
+PARTS = {"polygons": "paper", "boxes and cylinders": "solids", RANDOM: "paper", "silhouettes": ""}
 """What imaginers are tried on, and the recipe that it is simulated by."""
-CONTEXTS = ("recorded", "unknown")
-"""What they are told: everything, or no constant."""
+CONTEXTS: dict[str, Context | Literal["recorded"]] = {
+    "recorded": "recorded",
+    "unknown": UNKNOWN,
+    "nominal": None,
+}
+"""What they are told: everything, no constant, or nominal constants where these are not the true ones."""
+DRAWN = 100
+"""Motions that are drawn from the futures of an action, for its energy score."""
 SHOWN_LEVELS = (0.5, 0.8, 0.9, 0.95)
 """Levels of regions that are looked at."""
 BINS = 15
@@ -92,9 +103,11 @@ class Shipped(Experiment):
             for part in parts
             for start in STARTS
             for context in CONTEXTS
-            if context == "recorded" or self._predictor.marginal
+            if context == "recorded"
+            or (self._predictor.marginal and (context == "unknown" or part == RANDOM))
         ]
-        return found + [ShippedTrial(part, "twin", "observed", "recorded") for part in parts if self.twin]
+        twins = [part for part in parts if self.twin and part != RANDOM]
+        return found + [ShippedTrial(part, "twin", "observed", "recorded") for part in twins]
 
     def identity(self) -> dict[str, Any] | None:
         """The predictor, and the objects."""
@@ -109,9 +122,7 @@ class Shipped(Experiment):
         batch = self._batches[trial.part]
         imaginer: Imaginer = self._predictor if trial.imaginer == "shipped" else TwinImaginer()
         (start,) = (each for each in get_args(Start) if each == trial.start)
-        imagined = imaginer.imagine_batch(
-            batch, start, context="unknown" if trial.context == "unknown" else "recorded"
-        )
+        imagined = imaginer.imagine_batch(batch, start, context=CONTEXTS[trial.context])
         return [
             {"metric": name, "value": value, "low": low, "high": high, "count": count}
             for name, (value, low, high, count) in measure(imagined, batch).items()
@@ -147,6 +158,7 @@ class Shipped(Experiment):
             "All, mean [cm]": "full",
         }
         shares = {
+            "Energy score [cm]": "energy_full",
             "Right": "right",
             "F1 of slips": "f1_slipped",
             "Brier": "brier",
@@ -210,15 +222,17 @@ class Shipped(Experiment):
         found = {}
         for part, recipe in PARTS.items():
             if recipe:
-                found[part] = self._simulated(recipe)
+                found[part] = self._simulated(recipe, RANDOMISED if part == RANDOM else NOTHING)
             elif self.silhouettes is not None:
                 found[part] = _levered_silhouettes(self.silhouettes)
         return found
 
-    def _simulated(self, recipe: str) -> InteractionBatch:
+    def _simulated(self, recipe: str, drawn: Randomisation) -> InteractionBatch:
         watched = 0.0 if recipe == "paper" else WATCHED
         simulation = SimulationConfig(embodiment="tool", watch_time=watched)
-        config = CollectConfig(self.objects, recipe=recipe, seed=self.seed, simulation=simulation)
+        config = CollectConfig(
+            self.objects, recipe=recipe, seed=self.seed, simulation=simulation, randomisation=drawn
+        )
         made = [simulate_trial(config, id) for id in range(num_trials(config))]
         made = [each for each in made if each.object.kind != "prism" or recipe == "paper"]
         return InteractionBatch.from_interactions([each for each in made if len(each.effect.times)])
@@ -245,6 +259,7 @@ def measure(imagined: ImaginedBatch, batch: InteractionBatch) -> Found:
 
     Returns:
         ``full`` and ``final``, means, and ``full_median``; with ``levered_`` in front, of those that were levered.
+        ``energy_full``: energy score of motions drawn from the futures.
         ``right``: outcomes that were the most probable ones; ``f1_slipped``; ``brier`` and ``brier_constant`` of the
         shares of the outcomes; ``ece``: expected calibration error of the most probable outcome, ``ece_edge``: of the
         pivot edge. ``wrong``: errors above a centimetre, ``warned``: expected to be, and ``auroc``: how well the
@@ -276,6 +291,8 @@ def measure(imagined: ImaginedBatch, batch: InteractionBatch) -> Found:
                 median = float(np.median(errors[rows]))
                 found[f"{start}{metric}_median"] = median, np.nan, np.nan, int(rows.sum())
     futures = imagined.futures
+    if np.isfinite(futures.spread).all():
+        note("energy_full", score(draw(futures, DRAWN)[:, :, :count], truth, valid)["energy_full"], every)
     chances = futures.outcomes()
     names, probability = np.array(list(chances)), np.stack(list(chances.values()), axis=1)
     best = names[probability.argmax(axis=1)]
@@ -300,6 +317,22 @@ def measure(imagined: ImaginedBatch, batch: InteractionBatch) -> Found:
             note(f"held_{level:g}", (scores <= futures.width(level)).astype(float), every)
         single["radius_0.5"] = CM * float(np.median(futures.radius(0.5)[rows, likeliest, lengths - 1]))
     return found | {name: (float(value), np.nan, np.nan, len(batch)) for name, value in single.items()}
+
+
+def draw(futures: Futures, num: int, seed: int = 0) -> Float[np.ndarray, "batch num time 3"]:
+    """Motions of centres of mass drawn from futures [m]: each is off by its future's spread, in one direction.
+
+    Args:
+        futures: The futures; their spreads must be known.
+        num: Motions for each action.
+        seed: Seed of the draw.
+    """
+    rng = np.random.default_rng(seed)
+    rows = np.arange(len(futures))[:, None]
+    passed = futures.probability.cumsum(axis=1)[:, None] < rng.random((len(futures), num, 1))
+    chosen = np.minimum(passed.sum(axis=2), futures.probability.shape[1] - 1)
+    off = rng.standard_normal((len(futures), num, 1, 3)) / 3**0.5
+    return futures.com[rows, chosen] + off * futures.spread[rows, chosen][..., None]
 
 
 def auroc(scores: Float[np.ndarray, " n"], positive: np.ndarray) -> float:
