@@ -1,5 +1,6 @@
 """The object is watched while the stand-in controller's arm levers it up; faults are injected into its poses."""
 
+import csv
 import json
 import sys
 import threading
@@ -344,3 +345,28 @@ def test_a_plan_imagined_anew_tells_a_stuck_object_sooner(plan_file):
         )
         alarms.append(next(t for t, pose in poses if monitor.update(t, pose).alarm))
     assert alarms[1] < alarms[0] - 0.3
+
+
+@needs_controller
+def test_a_plan_is_carried_out_by_the_command_over_a_controller(plan_file, base_file, tmp_path, capsys):
+    """From plan.json to the arm's joints, through the command, sockets and the controller: nothing is replaced."""
+    pytest.importorskip("rtde_control", reason="needs ur_rtde: pip install 'foretrace[ur]'")
+    base = json.loads(base_file.read_text())
+    base["T_table_base"] = [-0.75, 0, 0, 1, 0, 0, 0]
+    base_file.write_text(json.dumps(base))
+    common = ["robot", str(plan_file), "--base", str(base_file), "--speed", "1", "--no-retreat"]
+    assert cli.main([*common, "--out", str(tmp_path / "dry")]) == 0
+    with (tmp_path / "dry" / "path.csv").open(newline="") as file:
+        planned = list(csv.DictReader(file))
+    names = [name for name in planned[0] if name.endswith("_rad")][:6]
+    joints = np.array([[float(row[name]) for name in names] for row in planned])
+    start = joints[0] + np.array([0, 0, 0.004, 0, 0, 0])
+    out = tmp_path / "executed"
+    with RunningController(start) as controller:
+        move = ["--execute", "--host", controller.host, "--yes", "--timeout", "1.5"]
+        assert cli.main([*common, "--out", str(out), *move]) == 0
+    assert capsys.readouterr().out.strip().endswith(str(out / "recording.csv"))
+    np.testing.assert_allclose(controller.facts.joints, joints[-1], atol=1e-4)
+    with (out / "recording.csv").open(newline="") as file:
+        legs = {row["leg"] for row in csv.DictReader(file)}
+    assert {"approach", "descent", "lever-up"} <= legs
