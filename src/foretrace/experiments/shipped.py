@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
 from foretrace.errors import ResultsError, ViewError
-from foretrace.evaluation.charts import GREEN, SKY, VERMILLION, finish, grid
+from foretrace.evaluation.charts import GREEN, PURPLE, SKY, VERMILLION, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial
 from foretrace.evaluation.metrics import METRICS
 from foretrace.evaluation.statistics import interval
@@ -199,16 +199,22 @@ class Shipped(Experiment):
                 ("observed", "recorded"): GREEN,
                 ("estimated", "recorded"): SKY,
                 ("estimated", "unknown"): VERMILLION,
+                ("estimated", "nominal"): PURPLE,
             }.items():
                 mine = rows[rows["part"].eq(part) & rows["start"].eq(start) & rows["context"].eq(context)]
                 mine = mine[mine["imaginer"].eq("shipped")].set_index("metric")["value"]
                 shown = mine.reindex([f"held_{level:g}" for level in SHOWN_LEVELS])
-                ax.plot(SHOWN_LEVELS, shown, "o-", color=color, label=f"start {start}, context {context}")
+                if shown.notna().any():
+                    ax.plot(SHOWN_LEVELS, shown, "o-", color=color, label=f"start {start}, context {context}")
             ax.set_title(part.capitalize())
             ax.set_xlabel("level of the region")
             grid(ax, ylabel="whole motions within it" if part == parts[0] else "")
-        handles, labels = fig.axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside lower center", ncols=4)
+        named = {
+            label: line
+            for ax in fig.axes
+            for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
+        }
+        fig.legend(list(named.values()), list(named), loc="outside lower center", ncols=5)
         finish(fig, "Prediction regions on lever-ups that were not trained on", "")
         return {"regions": fig}
 
