@@ -2,7 +2,8 @@
 
 A direct trajectory predictor is trained without one family, and asked about that one and about those that it has
 learned from. Two scores are to tell errors above a centimetre: the error that it expects, which grows where networks
-disagree, and the distance of what they are given from the nearest actions of the training part.
+disagree, and the distance of what they are given from the nearest actions of the training part. Starts are estimated from
+views, so that objects of uniform density alone are asked about.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 from tyro.conf import Fixed, Suppress
 
-from foretrace.errors import ResultsError
+from foretrace.errors import PredictionError, ResultsError
 from foretrace.evaluation.charts import ORANGE, SKY, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds, chosen
 from foretrace.evaluation.metrics import METRICS
@@ -27,6 +28,8 @@ from foretrace.evaluation.tables import markdown_table, mean_with_interval, numb
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.shipped import auroc, measure
 from foretrace.experiments.training import Recipe
+from foretrace.imagined.context import column_of
+from foretrace.imagined.domain import OWN, check_contacts
 from foretrace.imagined.imaginer import UNSURE
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.dataset import Dataset
@@ -136,7 +139,7 @@ class NovelFamilies(Experiment):
         learned = KDTree(predictor.network_inputs(batch[np.sort(train)]))
         rows: list[Row] = []
         for part, numbers in (("known", np.sort(known)), ("held out", np.flatnonzero(mine))):
-            test = batch[numbers]
+            test = batch[numbers[self._askable[numbers]]]
             imagined = predictor.imagine_batch(test, "estimated", context="recorded")
             found = {name: value for name, (value, *_) in measure(imagined, test).items()}
             valid = np.arange(test.com.shape[1]) < test.length[:, None]
@@ -200,6 +203,12 @@ class NovelFamilies(Experiment):
         return {"auroc": fig}
 
     @cached_property
+    def _askable(self) -> np.ndarray:
+        """(batch,) bool: actions on objects of uniform density, at whose rim they begin."""
+        uniform = np.nan_to_num(column_of(self._batch, "com_offset")) == 0
+        return uniform & np.array([_at_rim(mask) for mask in self._batch.mask])
+
+    @cached_property
     def _data(self) -> tuple[InteractionBatch, np.ndarray]:
         assert self.data is not None
         dataset = Dataset.open(self.data)
@@ -214,6 +223,14 @@ class NovelFamilies(Experiment):
     @property
     def _families(self) -> np.ndarray:
         return self._data[1]
+
+
+def _at_rim(mask: np.ndarray) -> bool:
+    try:
+        check_contacts(mask, *OWN)
+    except PredictionError:
+        return False
+    return True
 
 
 def family_of(obj: Mapping[str, Any]) -> str:
