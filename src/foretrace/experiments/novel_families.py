@@ -2,8 +2,8 @@
 
 A direct trajectory predictor is trained without one family, and asked about that one and about those that it has
 learned from. Two scores are to tell errors above a centimetre: the error that it expects, which grows where networks
-disagree, and the distance of what they are given from the nearest actions of the training part. Starts are estimated from
-views, so that objects of uniform density alone are asked about.
+disagree, and the distance of what they are given from the nearest actions of the training part. Starts are estimated
+from views, so that objects of uniform density alone are asked about.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,6 +59,7 @@ CONTEXT = (
 )
 OUTCOMES = ("levered", "slipped", "tumbled", "rolled", "missed")
 SHOWN = {
+    "count": "Lever-ups",
     "levered_full": "Levered [cm]",
     "right": "Right",
     "held_0.5": "In 50 %",
@@ -145,6 +146,7 @@ class NovelFamilies(Experiment):
             valid = np.arange(test.com.shape[1]) < test.length[:, None]
             error = np.asarray(METRICS["full"](imagined.com, np.where(valid[..., None], test.com, np.nan)))
             distance = learned.query(predictor.network_inputs(test), k=NEIGHBOURS)[0][:, -1]
+            found["count"] = len(test)
             found |= foretold(imagined.futures.expected_error(), distance, error > UNSURE)
             rows += [{"part": part, "metric": name, "value": value} for name, value in found.items()]
         return rows
@@ -168,7 +170,7 @@ class NovelFamilies(Experiment):
                     *(
                         mean_with_interval(found.get(name), missing="-")
                         if name == "levered_full"
-                        else number((found.get(name) or {}).get("mean"))
+                        else number((found.get(name) or {}).get("mean"), 0 if name == "count" else 3)
                         for name in SHOWN
                     ),
                 ]
