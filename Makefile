@@ -81,7 +81,7 @@ bench: setup
 	for name in simulate agreement training; do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 figures: setup
-	$(BIN)/foretrace evaluate paper --out docs/results/paper --twins docs/results/twin --redraw
+	$(BIN)/foretrace evaluate paper --out docs/results/paper --twins docs/results/twin docs/results/residual --redraw
 
 # The predictor that comes with the package: an hour of simulation on one core, and half an hour of training. Its regions
 # are calibrated on lever-ups of other objects.

@@ -278,7 +278,8 @@ class Twin(Experiment):
         ax.plot([], [], "_", color=INK, markersize=11, markeredgewidth=1.6, label="median")
         ax.set_xticks(range(len(summary)), [PARTS[part].replace(" held", "\nheld") for part in summary])
         ax.set_yscale("log")
-        ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        for axis_of in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+            axis_of(FormatStrFormatter("%g"))
         grid(ax, ylabel="error, full trajectory [cm]")
         fig.legend(loc="outside lower center", ncols=5)
         finish(
