@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator
 from tyro.conf import Fixed, Suppress
 
 from foretrace.errors import ResultsError, ViewError
@@ -278,8 +278,9 @@ class Twin(Experiment):
         ax.plot([], [], "_", color=INK, markersize=11, markeredgewidth=1.6, label="median")
         ax.set_xticks(range(len(summary)), [PARTS[part].replace(" held", "\nheld") for part in summary])
         ax.set_yscale("log")
-        for axis_of in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-            axis_of(FormatStrFormatter("%g"))
+        ax.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        for label_ticks in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+            label_ticks(FormatStrFormatter("%g"))
         grid(ax, ylabel="error, full trajectory [cm]")
         fig.legend(loc="outside lower center", ncols=5)
         finish(
