@@ -60,6 +60,8 @@ class OnnxPredictor(Imaginer):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.log_severity_level = 3
+        # Its own heap would keep what the largest batch needed, 400 MB for the rim of a plan.
+        options.enable_cpu_mem_arena = options.enable_mem_pattern = False
         if not file.is_file():
             raise CheckpointError(f"{file} does not exist: {REMEDY}")
         try:

@@ -1,5 +1,6 @@
 """The studio's server: a page of its own for each visitor."""
 
+import gc
 import time
 import warnings
 from contextlib import redirect_stdout
@@ -46,6 +47,8 @@ class StudioServer:
         """Every visitor's page, by the number of the connection."""
         self._lock = Lock()
         learned()
+        gc.collect()
+        gc.freeze()  # figures refer to themselves: without all that is here now, they are collected soon
         # A visitor who leaves while something is drawn is no fault.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", module="viser")
         try:
