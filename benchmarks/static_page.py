@@ -1,5 +1,7 @@
 """The studio's static page in headless Chromium: size, first picture, answers to a drag, numbers against Python's.
 
+`first_picture_s` counts until the first futures are drawn, `network_ready_s` until others can be; `drag_ms` from
+the pointer's event until the new futures are drawn, one after the other around the object.
 Needs `pip install playwright`, Chromium and npm, or --onnxruntime-web.
 """
 
@@ -24,6 +26,48 @@ DRAG = """async (count) => {
   }
   return taken;
 }"""
+
+LISTEN = """() => {
+  const found = window.found = { taken: [], asked: null, shown: false };
+  document.getElementById("canvas").addEventListener("pointermove", (event) => {
+    if (event.buttons) found.asked = event.timeStamp;
+  }, true);
+  const { draw, showFutures } = Stage.prototype;
+  Stage.prototype.showFutures = function (...given) {
+    showFutures.apply(this, given);
+    found.shown = found.asked !== null;
+  };
+  Stage.prototype.draw = function () {
+    draw.apply(this);
+    found.stage = this;
+    if (found.shown) found.taken.push(performance.now() - found.asked);
+    if (found.shown) Object.assign(found, { asked: null, shown: false });
+  };
+}"""
+PLACE = """([x, y]) => {
+  const { scene, grip } = found.stage, { left, top } = scene.canvas.getBoundingClientRect();
+  const place = scene.project(x === null ? grip : [x, y, 0]);
+  return [left + place[0], top + place[1]];
+}"""
+
+
+def summary(taken: list[float]) -> dict[str, float]:
+    """Median and 95 % quantile."""
+    return {"median": float(np.median(taken)), "p95": float(np.quantile(taken, 0.95)), "n": len(taken)}
+
+
+def drag(page: Any, count: int) -> list[float]:
+    """Drag the grip around the object; returns the time until the futures have followed, each time [ms]."""
+    page.evaluate(LISTEN)
+    page.wait_for_function("found.stage")
+    page.mouse.move(*page.evaluate(PLACE, [None, None]))
+    page.mouse.down()
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        page.mouse.move(*page.evaluate(PLACE, [0.12 * np.cos(angle), 0.12 * np.sin(angle)]))
+        page.wait_for_function(f"found.taken.length > {k}")
+    page.mouse.up()
+    return page.evaluate("found.taken")
 
 
 def main() -> None:
@@ -53,17 +97,20 @@ def main() -> None:
         "viewport": {"width": options.width, "height": round(options.width * 0.6)},
         "color_scheme": "dark" if options.dark else "light",
     }
-    first, found, taken = [], [], []
+    first, ready, found, taken, followed = [], [], [], [], []
     with TemporaryDirectory() as folder:
         page = write_static_page(Path(folder), options.onnxruntime_web)
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
         for number in range(options.opened):
             with opened(page, **looks) as visited:
-                first.append(visited.evaluate("performance.getEntriesByName('first picture')[0].startTime"))
+                visited.wait_for_function("performance.getEntriesByName('network ready').length")
+                for times, mark in ((first, "first picture"), (ready, "network ready")):
+                    times.append(visited.evaluate(f"performance.getEntriesByName('{mark}')[0].startTime"))
                 if number:
                     continue
                 found = visited.evaluate(IMAGINE, [as_page_choices(each) for each in cases])
                 taken = visited.evaluate(DRAG, options.drags)
+                followed = drag(visited, options.drags)
                 if options.picture is not None:
                     visited.uncheck("#play")
                     visited.evaluate("document.getElementById('time').value = 2.0")
@@ -77,7 +124,9 @@ def main() -> None:
             {
                 "size_mb": size / 1e6,
                 "first_picture_s": [each / 1000 for each in first],
-                "imagined_ms": {"median": np.median(taken), "p95": np.quantile(taken, 0.95), "n": len(taken)},
+                "network_ready_s": [each / 1000 for each in ready],
+                "imagined_ms": summary(taken),
+                "drag_ms": summary(followed),
                 "cases": len(cases),
                 "refused_alike": sum(
                     page is None and python is None for page, python in zip(found, wanted, strict=True)

@@ -35,7 +35,7 @@ from foretrace.studio import stage
 from foretrace.studio.choices import FIRST, LIMITS, PHYSICS, Choices
 from foretrace.studio.controls import KNOBS
 from foretrace.studio.scenery import LEAST_PROBABLE, MOST_FUTURES, MOST_UPRIGHTS
-from foretrace.studio.session import LEVEL, learned
+from foretrace.studio.session import LEVEL, Session, learned
 from foretrace.studio.shapes import EXAMPLES, MOST_CORNERS
 from foretrace.studio.texts import LEAST_SHOWN
 
@@ -131,6 +131,18 @@ def optimised(file: Path) -> bytes:
         return Path(options.optimized_model_filepath).read_bytes()
 
 
+def first_outputs() -> dict[str, list[float]]:
+    """What the network returns for the first choices, flat, so that the page need not wait for it."""
+    found = Session(Choices()).imagined.futures
+    outputs = {
+        "probability": found.probability,
+        "com_trajectory": found.states[..., :3],
+        "rotation_vector": found.states[..., 3:],
+        "spread": found.spread,
+    }
+    return {name: [float(f"{each:.9g}") for each in np.ravel(values)] for name, values in outputs.items()}
+
+
 def page_facts(predictor: OnnxPredictor) -> dict[str, Any]:
     """All that the page's scripts know beside the network: limits, constants, examples, colours; JSON-able."""
     choices = Choices()
@@ -174,6 +186,7 @@ def page_facts(predictor: OnnxPredictor) -> dict[str, Any]:
     shapes = {
         "examples": {name: _prism(each) for name, each in examples.items()},
         "first": FIRST,
+        "firstOutputs": first_outputs(),
         "bevel": asdict(BEVEL),
         "smallest": SIZE_LIMITS[0],
         "largest": SIZE_LIMITS[1],

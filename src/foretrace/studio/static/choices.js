@@ -19,6 +19,10 @@ const Choices = (() => {
     return { action, path, com: Array.from(inputs.com), ...Futures.read(outputs, inputs.context, Lever.times(path.speed).duration) };
   }
 
+  /** The network's outputs for the first choices, which are there before the network is. */
+  const runFirst = async () =>
+    Object.fromEntries(Object.entries(FACTS.firstOutputs).map(([name, values]) => [name, Float32Array.from(values)]));
+
   /** All that differs from the first choices. */
   function toText(chosen) {
     const parts = [];
@@ -64,5 +68,5 @@ const Choices = (() => {
     return Prism.make(corners, height, { width, height: depth });
   }
 
-  return { example, first, fromText, imagine, toText };
+  return { example, first, fromText, imagine, runFirst, toText };
 })();

@@ -107,5 +107,5 @@ const Geometry = (() => {
     return signed > 0 ? corners : [corners[0], ...corners.slice(1).reverse()];
   }
 
-  return { area, convexHull, cross, distance, edges, hullIndices, innerRadius, inside, minus, nearest, normals, simplePolygon };
+  return { area, convexHull, cross, distance, edges, hullIndices, innerRadius, inside, minus, nearest, normals, simplePolygon, toOutline };
 })();

@@ -2,7 +2,7 @@
 // The network in ONNX Runtime; both are packed into this folder, so that the page also works from a file.
 
 const Network = (() => {
-  let session = null, last = Promise.resolve();
+  let ready = null, last = Promise.resolve();
 
   function decoded(text) {
     if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
@@ -16,8 +16,16 @@ const Network = (() => {
     return new Uint8Array(await new Response(stream).arrayBuffer());
   }
 
-  /** Get ready; takes about a second. */
-  async function load() {
+  /** Get ready, which takes about a second, once the page has been drawn. */
+  const load = () => (ready ||= begin());
+
+  async function begin() {
+    await new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+    if (typeof PACKED === "undefined") await new Promise((resolve, reject) => {
+      const file = document.getElementById("packed");
+      file.addEventListener("load", resolve);
+      file.addEventListener("error", () => reject(new Error("packed.js, which holds the network, is missing")));
+    });
     const [script, wasm, model] = await Promise.all([PACKED.runtime, PACKED.wasm, PACKED.model].map(unpacked));
     const address = URL.createObjectURL(new Blob([script], { type: "text/javascript" }));
     const ort = await import(address);
@@ -26,12 +34,14 @@ const Network = (() => {
     ort.env.wasm.numThreads = 1;
     // It was optimised when it was packed.
     const made = await ort.InferenceSession.create(model, { executionProviders: ["wasm"], graphOptimizationLevel: "disabled" });
-    session = { run: (feeds) => made.run(feeds), tensor: (values) => new ort.Tensor("float32", values, [1, values.length]) };
+    performance.mark("network ready");
+    return { run: (feeds) => made.run(feeds), tensor: (values) => new ort.Tensor("float32", values, [1, values.length]) };
   }
 
   /** Outputs by name for inputs by name; one call after the other. */
   function run(inputs) {
     const work = async () => {
+      const session = await load();
       const feeds = Object.fromEntries(Object.entries(inputs).map(([name, values]) => [name, session.tensor(values)]));
       const found = await session.run(feeds);
       return Object.fromEntries(Object.entries(found).map(([name, tensor]) => [name, tensor.data]));

@@ -41,12 +41,13 @@
     find("example").value = chosen.object.name || "";
     find("height").value = Math.round(1e4 * chosen.object.height) / 10;
     if (changes.object) stage.showObject(chosen.object);
+    if (!drawn) stage.showGrip(Lever.place(chosen.object.corners, chosen.along, chosen.turn));
     const text = Choices.toText(chosen);
     history.replaceState(null, "", text ? `#${text}` : location.pathname + location.search);
     const number = ++latest;
     let found = null, fault = "";
     try {
-      found = await Choices.imagine(chosen, Network.run);
+      found = await Choices.imagine(chosen, text ? Network.run : Choices.runFirst);
     } catch (error) {
       fault = error.message;
     }
@@ -54,7 +55,6 @@
     imagined = found;
     say(fault);
     showResult();
-    stage.showGrip(Lever.place(chosen.object.corners, chosen.along, chosen.turn));
     stage.showFutures(imagined, find("tubes").checked);
     find("time").max = imagined ? imagined.times[imagined.times.length - 1] : 3;
   }
@@ -192,7 +192,6 @@
   }
 
   async function begin() {
-    const ready = Network.load(); // compiles while the rest is made
     stage = new Stage(new Scene(find("canvas")), find("labels"));
     for (const name of ["along", "turn"]) addSlider(name, "action");
     for (const name of FACTS.physics) addSlider(name, "physics");
@@ -215,11 +214,11 @@
         return Choices.first();
       }
     };
-    await ready;
     chosen = Choices.first();
-    await change(read());
+    change(read());
     window.addEventListener("hashchange", () => change(read()));
     requestAnimationFrame(tick);
+    await Network.load();
   }
 
   begin().catch((error) => say(error.message));

@@ -67,7 +67,7 @@ const View = (() => {
       const row = Math.floor(place / size / side), column = Math.floor((place % size) / side);
       if (filled) features[2 * maxCorners + row * cells + column] += share;
     });
-    const com = Prism.centreOfMass(object), { width, height } = object.bevel;
+    const { com, bevel: { width, height } } = object;
     const known = { ...physics, ...path, bevel_width: width, bevel_height: height };
     return {
       features,
