@@ -144,13 +144,14 @@ def _draw(
     truth: "Interaction | None",
     animation: bool,
 ) -> None:
-    from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.prediction import scene_of
     from foretrace.pictures.scene import scene_figure
 
     scene = scene_of(obj, action, imagined, name, truth)
     scene_figure(scene).savefig(out / "prediction.png")
     if animation:
+        from foretrace.pictures.animation import scene_animation
+
         scene_animation(scene, out / "prediction.gif")
 
 

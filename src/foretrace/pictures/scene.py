@@ -47,6 +47,9 @@ TOOL_REACH = 0.12
 ARROW_LENGTH = 0.045
 """Length of the arrow that shows the action [m]."""
 
+LEGEND, LEGEND_ROW = 0.6, 0.2
+"""Height of what is below the axes, and of each row of the legend there [inches]."""
+
 
 class Ghost(NamedTuple):
     """A motion of the object that is predicted beside the one that is shown, drawn as its edges."""
@@ -203,16 +206,21 @@ def interaction_figure(
 
 @styled
 def scene_figure(scene: Scene) -> Figure:
-    """The picture of `interaction_figure` for any scene."""
-    fig = new_figure(13.2, 4.9)
-    grid = fig.add_gridspec(3, 3, width_ratios=[1.0, 1.28, 1.05])
+    """The picture of `interaction_figure` for any scene. Places are fixed: to find them takes as long as to draw."""
+    width, height = 13.2, 4.9
+    fig, handles = new_figure(width, height, layout="none"), legend_of(scene)
+    bottom = LEGEND + LEGEND_ROW * -(-len(handles) // 2)
+    grid = fig.add_gridspec(
+        3, 3, width_ratios=[1.0, 1.28, 1.05], left=0.04, right=0.99, bottom=bottom / height, top=0.89, wspace=0.15,
+        hspace=0.11,
+    )  # fmt: skip
     draw_from_above(fig.add_subplot(grid[:, 0]), scene)
     draw_from_the_side(fig.add_subplot(grid[:, 1]), scene)
     first = fig.add_subplot(grid[0, 2])
     axes = [first, *(fig.add_subplot(grid[k, 2], sharex=first) for k in (1, 2))]
     draw_over_time(axes, scene)
     headline(fig, scene.title)
-    fig.legend(handles=legend_of(scene), loc="outside lower center", ncols=2, fontsize=9)
+    fig.legend(handles=handles, loc="lower center", ncols=2, fontsize=9)
     return fig
 
 

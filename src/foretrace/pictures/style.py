@@ -4,7 +4,7 @@ The colours are Okabe and Ito's, which colour-blind readers can tell apart; line
 """
 
 import zlib
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -62,9 +62,9 @@ styled = mpl.rc_context(STYLE)
 """Decorator of functions that draw in this style."""
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """An empty picture [inches] whose axes make room for labels and legends."""
-    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+def new_figure(width: float, height: float, layout: Literal["constrained", "none"] = "constrained") -> Figure:
+    """An empty picture [inches] whose axes make room for labels and legends, unless they have places of their own."""
+    return Figure(figsize=(width, height), dpi=DPI, layout=layout)
 
 
 def headline(fig: Figure, title: str) -> None:
