@@ -20,15 +20,18 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 TEXTS = ("0 0\n0.1 0\n0.05 0.1", "0 0\n0.1 0", "x", "", "565 209", "1 2 3 4")
 SHARES = {
-    "drag": 0.32, "turn": 0.08, "look": 0.05, "slider": 0.2, "box": 0.08, "tab": 0.08, "choose": 0.06,
+    "drag": 0.3, "turn": 0.08, "look": 0.05, "slider": 0.18, "box": 0.08, "tab": 0.08, "folder": 0.04, "choose": 0.06,
     "button": 0.08, "write": 0.03, "click": 0.02,
 }  # fmt: skip
 """How often each action is taken."""
 SIZE = {"width": 860, "height": 520}
 COARSE = 0.25
 """Pixels that are drawn for each of the page's: without a graphics card, drawing takes most of the time."""
-PATIENCE = 3000
+PATIENCE = 5000
 """An element that cannot be used within this time is left alone [ms]."""
+FOLDERS = ("Physics", "Path of the blade", "Show", "Corners as text", "Photograph")
+CHOICES = ("Object", "Plan", "Watch")
+"""Tabs with something to choose."""
 KEYS = ("ArrowLeft", "ArrowRight", "Home", "End")
 
 
@@ -100,11 +103,24 @@ class Visit:
             self.any("[role=tab]").click(timeout=PATIENCE)
         elif kind == "button":
             self.any("button.mantine-Button-root").click(timeout=PATIENCE)
+        elif kind == "folder":
+            shown = [each for each in FOLDERS if self.page.get_by_text(each, exact=True).is_visible()]
+            name = str(self.rng.choice([*shown, "Physics"]))
+            self.page.get_by_text(name, exact=True).click(timeout=PATIENCE)
         elif kind == "choose":
+            self.tab(str(self.rng.choice(CHOICES)))
             self.any("input.mantine-Select-input").click(timeout=PATIENCE)
             self.any("[role=option]").click(timeout=PATIENCE)
         elif kind == "write":
-            self.any("textarea").fill(str(self.rng.choice(TEXTS)), timeout=PATIENCE)
+            self.tab("Object")
+            if not self.page.get_by_text("use these corners").is_visible():
+                self.page.get_by_text("Corners as text", exact=True).click(timeout=PATIENCE)
+            self.any("textarea:not([aria-hidden])").fill(str(self.rng.choice(TEXTS)), timeout=PATIENCE)
+            self.page.get_by_text("use these corners").click(timeout=PATIENCE)
+
+    def tab(self, name: str) -> None:
+        """Open a tab."""
+        self.page.get_by_role("tab", name=name).click(timeout=PATIENCE)
 
     def answers(self) -> bool:
         """Whether a drag still moves the contact."""
@@ -120,6 +136,13 @@ class Visit:
             if self.studio.session.choices != before:
                 return True
         return False
+
+
+def plain_light(studio: Any) -> None:
+    """Without shadows and reflections, of which a processor draws one picture in two seconds."""
+    scene = studio._client.scene
+    scene.configure_environment_map(None)
+    scene.configure_default_lights(cast_shadow=False)
 
 
 def memory() -> float:
@@ -144,7 +167,9 @@ def visits(options: argparse.Namespace, faults: list[str]) -> dict[str, Any]:
             page.goto(f"http://{server.address}")
             page.get_by_text("levered", exact=True).first.wait_for(timeout=120_000)
             page.get_by_label("play").uncheck()  # until a visitor ticks it again
-            visit = Visit(page, next(iter(server.pages.values())), rng)
+            studio = next(iter(server.pages.values()))
+            plain_light(studio)
+            visit = Visit(page, studio, rng)
             for kind in rng.choice(
                 list(SHARES), options.actions // options.visitors, p=list(SHARES.values())
             ):
