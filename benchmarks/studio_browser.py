@@ -154,9 +154,11 @@ def visits(options: argparse.Namespace, faults: list[str]) -> dict[str, Any]:
     """Let visitors come, act and go."""
     from playwright.sync_api import Error, sync_playwright
 
+    from foretrace.studio.heaps import share_heaps
     from foretrace.studio.server import StudioServer
     from static_page_cases import SOFTWARE, chromium
 
+    share_heaps()  # as the command does
     rng, done, missed, used, answered = np.random.default_rng(options.seed), Counter(), Counter(), [], []
     server, started = StudioServer(port=0), time.monotonic()
     with sync_playwright() as playwright:

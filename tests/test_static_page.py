@@ -28,8 +28,8 @@ from static_page_cases import (
 STATIC = Path(static_page.__file__).parent / "static"
 NUMBERS = ("geometry", "pieces", "prism", "lever", "outline", "view", "futures", "choices")
 """Scripts that need no browser."""
-CLOSE = 1e-4
-"""Largest difference [m]."""
+CLOSE = 1e-5
+"""Largest difference of positions and radii [m], and of rotation vectors and probabilities."""
 HARNESS = """
 const fs = require("fs"), vm = require("vm"), given = JSON.parse(fs.readFileSync(0));
 for (const script of given.scripts) vm.runInThisContext(script);
@@ -86,10 +86,7 @@ def test_the_page_imagines_what_python_imagines() -> None:
     read = in_node([as_page_choices(cases[k]) for k in kept], outputs)["found"]
     for k, each in zip(kept, read, strict=True):
         apart = differences(each["imagined"], wanted[k])
-        assert apart["com"] < CLOSE, (k, apart)
-        assert apart["radius"] < CLOSE, (k, apart)
-        assert apart["turn"] < 1e-3, (k, apart)
-        assert apart["probability"] < 2e-3, (k, apart)
+        assert max(apart.values()) < CLOSE, (k, apart)
 
 
 def known(inputs: dict[str, list]) -> dict[str, list]:
