@@ -208,7 +208,7 @@ def interaction_figure(
 def scene_figure(scene: Scene) -> Figure:
     """The picture of `interaction_figure` for any scene. Places are fixed: to find them takes as long as to draw."""
     width, height = 13.2, 4.9
-    fig, handles = new_figure(width, height, layout="none"), legend_of(scene)
+    fig, handles = new_figure(width, height, layout=None), legend_of(scene)
     bottom = LEGEND + LEGEND_ROW * -(-len(handles) // 2)
     grid = fig.add_gridspec(
         3, 3, width_ratios=[1.0, 1.28, 1.05], left=0.04, right=0.99, bottom=bottom / height, top=0.89, wspace=0.15,

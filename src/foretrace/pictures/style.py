@@ -62,7 +62,7 @@ styled = mpl.rc_context(STYLE)
 """Decorator of functions that draw in this style."""
 
 
-def new_figure(width: float, height: float, layout: Literal["constrained", "none"] = "constrained") -> Figure:
+def new_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     """An empty picture [inches] whose axes make room for labels and legends, unless they have places of their own."""
     return Figure(figsize=(width, height), dpi=DPI, layout=layout)
 
