@@ -487,6 +487,16 @@ def test_a_visitor_watches_and_saves(served):
         visitor.look(lambda: "goal:move" in visitor.value("link"))
 
 
+def test_a_choice_that_is_made_while_something_is_drawn_is_kept(served):
+    with visit(served) as visitor:
+        page = list(served.pages.values())[-1]
+        with page._lock:
+            visitor.set("goal", "move")
+            visitor.look(seconds=0.5)
+            page.controls.show_choices(page.session.choices)  # as a picture of the former choices does
+        visitor.look(lambda: "goal:move" in visitor.value("link"))
+
+
 def test_a_link_that_cannot_be_read_is_told(served):
     with visit(served, "along:far") as visitor:
         assert "the link says along:&#x27;far&#x27;" in visitor.html

@@ -80,7 +80,7 @@ class Slider:
         self._name_it()
 
         @self.handle.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             if event.client_id is not None:  # moved by the visitor, not by the page
                 self._name_it()
                 moved(name)

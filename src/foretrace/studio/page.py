@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
-from threading import Event, RLock, Thread
+from threading import Event, Lock, RLock, Thread
 from time import perf_counter
 from typing import Any
 
@@ -51,9 +51,10 @@ class Page:
         self.latencies: list[float] = []
         """Seconds from each of the last events to its picture."""
         self._client, self._data, self._address = client, data, address
-        self._lock, self._numbers, self._latest = RLock(), count(1), 0
+        self._lock, self._order, self._numbers, self._latest = RLock(), Lock(), count(1), 0
         self._closed = Event()
         self._dragged: tuple[np.ndarray, bool] | None = None
+        self._chosen: dict[str, Any] = {}
         self._told = -1
         self._message = ""
         self._photo: PhotoView | None = None
@@ -85,7 +86,8 @@ class Page:
             message: What the visitor is told about it; an error takes its place.
         """
         started = perf_counter()
-        self._latest = number = next(self._numbers)
+        with self._order:
+            self._latest = number = next(self._numbers)
         with self._lock:
             if self._closed.is_set():
                 return
@@ -100,20 +102,25 @@ class Page:
                 self._draw_what_takes_time(number)
 
     def _choose(self, name: str) -> None:
-        def work() -> None:
-            slider = self.controls.sliders.get(name)
-            self.session.change(**{name: slider.value if slider else getattr(self.controls, name).value})
+        """Note at once what the visitor has chosen: what is drawn meanwhile shows the former choice again."""
+        slider = self.controls.sliders.get(name)
+        self._chosen[name] = slider.value if slider else getattr(self.controls, name).value
+        self._later(lambda: self._take_choice(name))
 
-        self.act(work)
+    def _take_choice(self, name: str) -> None:
+        value = self._chosen.pop(name, OWN)  # a later choice of the same may have been taken already
+        if name == "example" and value != OWN:
+            self._take(example(value))
+        elif value != OWN:
+            self.session.change(**{name: value})
 
     def _connect(self) -> None:
         controls = self.controls
-        for name in ("exact", "imaginer", "goal"):
-            _on(getattr(controls, name), lambda name=name: self._choose(name))
+        for name in ("exact", "imaginer", "goal", "example"):
+            _at_once(getattr(controls, name), lambda name=name: self._choose(name))
         for handle in (controls.tubes, controls.twin, controls.rim, controls.arm):
             _on(handle, lambda: self.act(lambda: None))
         _on(controls.time, lambda: self._show_time(float(controls.time.value)))
-        _on(controls.example, lambda: self.act(self._take_example))
         _on(controls.draw, lambda: self.act(self._begin_outline))
         _on(controls.undraw, lambda: self.act(self._drawing.end))
         _on(controls.drawn, lambda: self.act(self._finish_outline))
@@ -127,11 +134,7 @@ class Page:
         for handle, name, make in (
             (controls.save_picture, "foretrace.png", lambda: picture(self.session, self._truth)),
             (controls.save_animation, "foretrace.gif", lambda: animation(self.session, self._truth)),
-            (
-                controls.save_video,
-                "foretrace.mp4",
-                lambda: animation(self.session, self._truth, ".mp4"),
-            ),
+            (controls.save_video, "foretrace.mp4", lambda: animation(self.session, self._truth, ".mp4")),
             (controls.save_plan, "plan.json", lambda: plan_file(self.session.plan)),
             (controls.save_lines, "foretrace_lines.py", lambda: python_lines(self.session).encode()),
         ):
@@ -180,18 +183,13 @@ class Page:
         middle = obj.corners.mean(axis=0)
         self._client.camera.look_at = (*middle.tolist(), 0.03)
 
-    def _take_example(self) -> None:
-        if self.controls.example.value != OWN:
-            self._take(example(self.controls.example.value))
-
     def _take_corners(self) -> None:
         self._take(from_text(self.controls.corners.value, self._height()))
 
     def _take_file(self) -> None:
         file = self.controls.upload.value
-        self._take(
-            from_file(file.name, file.content, self._height(), 0.001 * float(self.controls.scale.value))
-        )
+        scale = 0.001 * float(self.controls.scale.value)
+        self._take(from_file(file.name, file.content, self._height(), scale))
 
     def _take_row(self) -> None:
         if self._data is None:
@@ -389,5 +387,14 @@ def _on(handle: Any, work: Callable[[], None]) -> None:
 
     @listen
     def _(event: Any) -> None:
+        if event.client_id is not None:
+            work()
+
+
+def _at_once(handle: Any, work: Callable[[], None]) -> None:
+    """Do something short in the thread that takes in messages, in their order, when the visitor changes a value."""
+
+    @handle.on_update
+    async def _(event: Any) -> None:
         if event.client_id is not None:
             work()
