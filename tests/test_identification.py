@@ -1,5 +1,6 @@
 """Identification: what a motion tells of frictions and centre of mass, and what it does not."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -84,6 +85,55 @@ def test_the_contact_of_an_execution_to_come_may_be_off_by_as_much_as_before():
     assert drawn["friction"].std() < 0.1 * found.prior_std["friction"]
     worlds = Slider().imagine(VIEW, ACTION, context=found).worlds
     assert np.ptp(worlds.values["contact_left"][:256]) > 0.98 * (high - low)
+
+
+def test_of_another_object_in_the_same_world_the_frictions_alone_are_known():
+    belief = ft.identify(VIEW, ACTION, observed(0.65, 0.012), imaginer=Slider())
+    other = belief.of_another_object()
+    prior = identification.first_prior()
+    assert other.mean["friction"] == pytest.approx(belief.mean["friction"], abs=0.01)
+    assert other.std["friction"] == pytest.approx(belief.std["friction"], rel=0.1)
+    for name in set(belief.names) - {"friction", "tool_friction"}:
+        assert other.mean[name] == pytest.approx(prior.mean[name], abs=0.02 * prior.std[name])
+        assert other.std[name] == pytest.approx(prior.std[name], rel=0.02)
+    kept = belief.of_another_object(("com_x", "com_y"))
+    assert ahead_of(kept) == pytest.approx(ahead_of(belief), abs=0.001)
+    assert kept.std["friction"] == pytest.approx(prior.std["friction"], rel=0.02)
+    with pytest.raises(PredictionError, match="'colour' is no constant"):
+        belief.of_another_object(("colour",))
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_belief_comes_back_from_its_file(tmp_path, learned):
+    belief = identification.first_prior()
+    if learned:
+        belief = ft.identify(VIEW, ACTION, observed(0.65, 0.012), imaginer=Slider())
+    belief.save(tmp_path / "belief.json")
+    again = ft.Belief.load(tmp_path / "belief.json")
+    assert again.is_prior is not learned
+    assert again.mean == pytest.approx(belief.mean, abs=1e-12)
+    assert again.learned == belief.learned
+    for name, values in belief.sample_ahead(16).items():
+        np.testing.assert_allclose(again.sample_ahead(16)[name], values, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 2}, "version"),
+        ({"weights": [1.0]}, "no belief"),
+        ({"values": {}}, "no belief"),
+        ({"weights": [-1.0] * 4096}, "no belief"),
+        ({"ranges": {"friction": [0.9, 1.0]}}, "out of its range"),
+        ({"ranges": {"colour": [0.0, 1.0]}}, "colour"),
+    ],
+)
+def test_a_file_that_holds_no_belief_is_refused(tmp_path, change, words):
+    file = tmp_path / "belief.json"
+    ft.Belief().save(file)
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(PredictionError, match=words):
+        ft.Belief.load(file)
 
 
 def test_a_bevel_is_believed_in_as_all_else():

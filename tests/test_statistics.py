@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foretrace.evaluation.statistics import TEST_TO_TRAIN, interval
+from foretrace.evaluation.statistics import TEST_TO_TRAIN, bootstrap, interval
 from foretrace.evaluation.tables import markdown_table, mean_with_interval, number
 
 
@@ -54,6 +54,16 @@ def test_seeds_that_share_objects_are_covered_where_the_plain_interval_is_not():
             found = interval(values, ratio)
             hits[k] += found.low <= 0 <= found.high
     assert hits[0] / 400 < 0.85 < 0.9 < hits[1] / 400
+
+
+def test_the_bootstrap_is_about_as_wide_as_the_t_interval_of_many_values():
+    values = np.random.default_rng(3).normal(2.0, 0.5, 200)
+    found, plain = bootstrap(values), interval(values, 0.0)
+    assert found.mean == plain.mean
+    assert found.low == pytest.approx(plain.low, abs=0.005)
+    assert found.high == pytest.approx(plain.high, abs=0.005)
+    assert bootstrap(values, 0.5).high < found.high
+    assert np.isnan(bootstrap([1.0]).low)
 
 
 def test_tables():

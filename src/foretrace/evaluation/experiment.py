@@ -40,6 +40,7 @@ SUMMARIES = {
     "pushes": "Where recorded pushes leave their objects.",
     "novel-families": "Families of objects that are new to the predictor.",
     "other-world": "Few lever-ups of another world, learned alone or over a twin.",
+    "identified-world": "What lever-ups in another world tell for its other objects.",
     "non-flat": "Masks against height maps of objects that are not flat.",
     "planning": "Plans beside simple rules and an oracle that simulates all.",
     "sequences": "Goals by several pushes or lever-ups, planned again or blind.",

@@ -13,6 +13,8 @@ from foretrace.interactions.splits import PAPER_SIZES
 TEST_TO_TRAIN = PAPER_SIZES[2] / PAPER_SIZES[0]
 """Size of the test part divided by that of the training part in the paper's split."""
 LARGEST_RATIO = 1.0
+RESAMPLED = 10_000
+"""Samples of a bootstrap."""
 
 
 class Interval(NamedTuple):
@@ -62,3 +64,19 @@ def interval(
     factor = 1 / count + min(test_to_train, LARGEST_RATIO)
     half = float(student.ppf((1 + level) / 2, count - 1) * np.sqrt(factor * sample.var(ddof=1)))
     return Interval(mean, mean - half, mean + half, count)
+
+
+def bootstrap(values: Sequence[float] | Float[np.ndarray, " n"] | pd.Series, level: float = 0.95) -> Interval:
+    """Mean of independent values and its percentile bootstrap interval.
+
+    Args:
+        values: One number for each independent draw.
+        level: Confidence level.
+    """
+    sample = np.asarray(values, dtype=float)
+    count = len(sample)
+    if count < 2:
+        return Interval(float(sample[0]) if count else np.nan, np.nan, np.nan, count)
+    drawn = np.random.default_rng(0).integers(count, size=(RESAMPLED, count))
+    low, high = np.percentile(sample[drawn].mean(axis=1), [50 * (1 - level), 50 * (1 + level)])
+    return Interval(float(sample.mean()), float(low), float(high), count)

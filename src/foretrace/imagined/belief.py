@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 from jaxtyping import Float
 
 from foretrace.errors import PredictionError, check_type, is_number, is_whole, shown
+from foretrace.files import as_path, read_versioned, write_json
 from foretrace.imagined.context import RANGES as LIMITS
 from foretrace.objects import BEVEL
 
@@ -30,9 +32,23 @@ NOMINAL_BEVEL = {"bevel_width": (BEVEL.width, BEVEL.width), "bevel_height": (BEV
 EXECUTION = ("contact_ahead", "contact_left", "contact_turn")
 """What differs between executions on the same object."""
 COM = ("com_x", "com_y")
+WORLD = ("friction", "tool_friction")
+"""What is the same for all objects on one table, under one blade."""
 LEARNED = 0.8
 """A constant counts as learned if its standard deviation is below this share of the prior's."""
 MOST = 1 << 20
+FORMAT, VERSION = "foretrace-belief", 1
+REMEDY = "save what foretrace.identify returned again"
+
+
+class BeliefEntries(TypedDict):
+    """Schema of a belief's file."""
+
+    ranges: dict[str, list[float]]
+    worlds: int
+    prior: bool
+    values: dict[str, list[float]]
+    weights: list[float]
 
 
 class Belief:
@@ -99,6 +115,27 @@ class Belief:
             "is_prior": False,
         }
         return found
+
+    def of_another_object(self, shared: tuple[str, ...] = WORLD) -> "Belief":
+        """What is believed of another object in the same world: all but what is shared is drawn anew from the prior.
+
+        Args:
+            shared: Names of the constants that stay.
+
+        Raises:
+            PredictionError: One of them is no constant of the belief.
+        """
+        if unknown := [name for name in shared if name not in self.names]:
+            raise PredictionError(
+                f"{shown(unknown[0])} is no constant of the belief: choose from {', '.join(self.names)}"
+            )
+        rng = np.random.default_rng(0)
+        count = len(self.values)
+        kept, fresh = self.sample(count, rng), Belief(self.ranges, particles=count)
+        values = fresh.values[rng.permutation(count)]
+        for name in shared:
+            values[:, self.names.index(name)] = kept[name]
+        return self.updated(values, np.full(count, 1 / count))
 
     @cached_property
     def mean(self) -> dict[str, float]:
@@ -173,6 +210,49 @@ class Belief:
                 low, high = self.ranges[name]
                 drawn[name] = low + (high - low) * (rng.permutation(n) + rng.random(n)) / n  # evenly spread
         return drawn
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a file.
+
+        Raises:
+            PredictionError: The file cannot be written.
+        """
+        content = {
+            "ranges": {name: list(pair) for name, pair in self.ranges.items()},
+            "worlds": self.worlds,
+            "prior": self.is_prior,
+            "values": dict(zip(self.names, self.values.T.tolist(), strict=True)),
+            "weights": self.weights.tolist(),
+        }
+        try:
+            write_json(as_path(path, PredictionError), {"format": FORMAT, "version": VERSION, **content})
+        except OSError as error:
+            raise PredictionError(f"{path} cannot be written ({error}): choose another file") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Belief":
+        """Read it from a file.
+
+        Raises:
+            PredictionError: The file is missing, damaged or of another version.
+        """
+        file = as_path(path, PredictionError)
+        found = read_versioned(file, BeliefEntries, FORMAT, VERSION, PredictionError, REMEDY, key="version")
+        prior = cls(found["ranges"], worlds=found["worlds"])
+        weights = np.array(found["weights"])
+        if (
+            set(found["values"]) != set(prior.names)
+            or {len(each) for each in found["values"].values()} != {len(weights)}
+            or not (np.isfinite(weights).all() and weights.min(initial=np.inf) >= 0 < weights.sum())
+        ):
+            raise PredictionError(f"{file} holds no belief: {REMEDY}")
+        values = np.column_stack([found["values"][name] for name in prior.names])
+        low, high = np.array(list(prior.ranges.values())).T
+        if not ((low - 1e-9 <= values) & (values <= high + 1e-9)).all():
+            raise PredictionError(f"{file} has a constant out of its range: {REMEDY}")
+        belief = prior.updated(values, weights)
+        belief.is_prior = found["prior"]
+        return belief
 
 
 def _range(name: object, pair: Any) -> tuple[float, float]:
