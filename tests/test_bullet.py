@@ -9,6 +9,7 @@ import pytest
 from foretrace.actions import LeverUp, Screwdriver, ToolPath
 from foretrace.cli import main
 from foretrace.errors import SimulationError
+from foretrace.geometry import quaternion_to_matrix
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.motions import GRAVITY, ContactParameters
 from foretrace.interactions.record import Outcome, Physics
@@ -40,6 +41,34 @@ def test_mass_and_inertia_are_the_objects() -> None:
     assert info[0] == pytest.approx(body.mass.mass)
     np.testing.assert_allclose(sorted(info[2]), np.linalg.eigvalsh(body.mass.inertia), rtol=1e-9)
     np.testing.assert_allclose(world.pose(number), [0, 0, 0, 1, 0, 0, 0], atol=1e-9)
+
+
+def test_a_push_changes_the_momentum_by_force_times_time() -> None:
+    world = World(0.002, (0.0, 0.0, 0.0))
+    body = Body.of(L_SHAPE, 600.0)
+    number = world.add_object(body, np.eye(4))
+    for _ in range(5):
+        world.push(number, np.array([3.0, -1.0, 0.5]))
+        world.bullet.stepSimulation()
+    world.bullet.stepSimulation()  # a push lasts one step
+    speed = np.array([3.0, -1.0, 0.5]) * 5 * 0.002 / body.mass.mass
+    np.testing.assert_allclose(world.velocity(number), [*speed, 0, 0, 0], rtol=1e-6, atol=1e-9)
+
+
+def test_a_pinned_point_stays_while_the_object_turns_about_it() -> None:
+    world = World(0.002, (0.0, 0.0, 0.0))
+    start = np.eye(4)
+    start[:2, 3] = 0.1, -0.2
+    number = world.add_object(Body.of(L_SHAPE, 600.0), start)
+    point = np.array([0.18, 0.02, 0.0])
+    world.pin(number, point)
+    for _ in range(200):
+        world.push(number, np.array([0.3, 0.5, 0.0]))
+        world.bullet.stepSimulation()
+    pose = world.pose(number)
+    here = pose[:3] + quaternion_to_matrix(pose[3:]) @ point
+    np.testing.assert_allclose(here, start[:3, 3] + point, atol=1e-3)
+    assert np.linalg.norm(pose[:3] - start[:3, 3]) > 0.05
 
 
 @pytest.mark.parametrize("obj", [SQUARE, L_SHAPE], ids=["one hull", "several hulls"])

@@ -508,6 +508,16 @@ def test_executions_are_decided_by_their_seed_and_differ_by_their_fault():
     np.testing.assert_array_equal(fault.poses, fault.normal)
 
 
+@pytest.mark.parametrize("fault", ["fixed", "pushed", "slip"])
+def test_another_engine_plays_the_same_executions_and_faults(fault):
+    pytest.importorskip("pybullet", reason="pybullet is not installed")
+    one, other = (make_execution(402, 1, fault, engine=engine) for engine in ("mujoco", "bullet"))
+    np.testing.assert_array_equal(one.object.corners, other.object.corners)
+    assert one.physics == other.physics
+    assert 1e-4 < np.abs(one.normal - other.normal).max() < 0.05
+    assert other.deviation[-1] > 0.005
+
+
 @pytest.mark.slow
 def test_plans_average_over_beliefs():
     config = ft.PlanConfig(spacing=0.05, directions=1, refine=0, check=0)

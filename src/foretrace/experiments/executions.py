@@ -1,7 +1,7 @@
 """Lever-ups that a monitor watches: normal ones, and ones in which something goes wrong, tracked with noise.
 
-Everything is simulated in MuJoCo with the blade alone. Each execution has a twin of its own in which nothing goes
-wrong, with the same object, constants and execution error: what separates the two is the fault's own effect.
+Everything is simulated with the blade alone, in MuJoCo or Bullet. Each execution has a twin of its own in which nothing
+goes wrong, with the same object, constants and execution error: what separates the two is the fault's own effect.
 """
 
 from collections.abc import Callable
@@ -24,6 +24,8 @@ from foretrace.imagined import ObservedMotion
 from foretrace.interactions.record import ExecutionOffset, Physics
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel, Prism, Weighted, sample_prism
+from foretrace.simulation.bullet_engine import BulletEngine
+from foretrace.simulation.bullet_world import World
 from foretrace.simulation.engine import sample_tool
 from foretrace.simulation.mujoco_engine import plan_carriage
 from foretrace.simulation.randomisation import RANDOMISED
@@ -48,6 +50,8 @@ POSITION_NOISE, ANGLE_NOISE = 0.0003, float(np.deg2rad(0.1))
 """Standard deviation of tracked poses along and about each axis [m, rad]."""
 DROPOUT = 0.03
 """Share of the samples at which the tracker loses the object."""
+ENGINES = ("mujoco", "bullet")
+"""What simulates."""
 TIMESTEP, PERIOD = 0.002, 0.05
 """Time step of the simulation, and time between tracked samples [s]."""
 MOVED = 0.003
@@ -111,14 +115,17 @@ def reachable(prism: Prism, rng: np.random.Generator) -> tuple[Prism, LeverUp]:
     return prism, sample_reachable_contacts(prism, rng, 1)[0]
 
 
-def make_execution(seed: int, number: int, fault: str = "", draw: Draw = draw_polygon) -> Execution:
-    """One execution, decided by its seed, number and fault.
+def make_execution(
+    seed: int, number: int, fault: str = "", draw: Draw = draw_polygon, engine: str = "mujoco"
+) -> Execution:
+    """One execution, decided by its seed, number, fault and engine.
 
     Args:
         seed: Seed of the set.
         number: Number within the set.
         fault: One of FAULTS, or empty.
         draw: Draws object and action.
+        engine: One of ENGINES.
     """
     rng = np.random.default_rng([seed, number, FAULTS.index(fault) + 1 if fault else 0])
     while True:
@@ -128,7 +135,7 @@ def make_execution(seed: int, number: int, fault: str = "", draw: Draw = draw_po
             varied, physics, _, offset = RANDOMISED.vary(prism, Physics(), action.path, rng)
         except (ViewError, ShapeError):
             continue
-        scene = Scene(varied, physics, action, offset)
+        scene = Scene(varied, physics, action, offset, engine)
         normal = scene.play()
         changed = with_fault(scene, fault, rng)
         poses = normal if changed is scene else changed.play()
@@ -151,6 +158,8 @@ class Scene:
     """The action as commanded."""
     offset: ExecutionOffset
     """Execution error."""
+    engine: str = "mujoco"
+    """One of ENGINES."""
     slip_time: float = np.inf
     """Time at which the blade is pulled out [s]."""
     fixed: Float[np.ndarray, "3"] | None = None
@@ -161,6 +170,42 @@ class Scene:
     def play(self) -> Float[np.ndarray, "time 7"] | None:
         """Poses of the object frame in the frame of the action as commanded; None: the simulation blew up."""
         executed = self.action.moved(**vars(self.offset))
+        poses = (self._in_bullet if self.engine == "bullet" else self._in_mujoco)(executed)
+        if not np.isfinite(poses).all():
+            return None
+        back = self.action.T_action_object @ invert_transform(executed.T_action_object)
+        return matrix_to_pose(back @ pose_to_matrix(poses))
+
+    def _force(self, executed: LeverUp, now: float) -> Float[np.ndarray, "3"]:
+        """Force of the push at a time [N], in the executed action's frame."""
+        start, lasting, *force = self.push
+        if not start <= now < start + lasting:
+            return np.zeros(3)
+        turn = (executed.T_action_object @ invert_transform(self.action.T_action_object))[:2, :2]
+        return np.array([*(turn @ force), 0.0])
+
+    def _in_bullet(self, executed: LeverUp) -> Float[np.ndarray, "time 7"]:
+        """Poses of the object in the executed action's frame."""
+
+        def disturb(world: World, body: int, now: float) -> None:
+            if self.fixed is not None and now == 0:
+                world.pin(body, self.fixed)
+            if (force := self._force(executed, now)).any():
+                world.push(body, force)
+
+        motion = BulletEngine("tool", TIMESTEP, PERIOD).play(
+            self.object,
+            executed.T_action_object,
+            executed.tool,
+            self._withdrawing(executed.tool_motion),
+            executed.duration,
+            self.physics,
+            disturb,
+        )
+        return motion.object_pose if not motion.diverged else np.full((1, 7), np.nan)
+
+    def _in_mujoco(self, executed: LeverUp) -> Float[np.ndarray, "time 7"]:
+        """Poses of the object in the executed action's frame."""
         samples = round(executed.duration / PERIOD)
         stride = round(PERIOD / TIMESTEP)
         motion = self._withdrawing(executed.tool_motion)
@@ -188,19 +233,13 @@ class Scene:
         data.qpos[7:] = control.start
         body = model.body("object").id
         poses = [data.qpos[:7].copy()]
-        start, lasting, *force = self.push
-        turn = (executed.T_action_object @ invert_transform(self.action.T_action_object))[:2, :2]
         for step, setpoint in enumerate(control.setpoints):
-            now = step * TIMESTEP
             data.ctrl[:] = setpoint
-            data.xfrc_applied[body, :2] = turn @ force if start <= now < start + lasting else 0.0
+            data.xfrc_applied[body, :3] = self._force(executed, step * TIMESTEP)
             mujoco.mj_step(model, data)
             if (step + 1) % stride == 0:
                 poses.append(data.qpos[:7].copy())
-        if not np.isfinite(poses).all():
-            return None
-        back = self.action.T_action_object @ invert_transform(pose)
-        return matrix_to_pose(back @ pose_to_matrix(np.array(poses)))
+        return np.array(poses)
 
     def _withdrawing(
         self, motion: Callable[[np.ndarray], Float[np.ndarray, "time 6"]]

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,6 @@ from foretrace.actions import LeverUp
 from foretrace.errors import ResultsError
 from foretrace.evaluation.charts import GREEN, ORANGE, SKY, VERMILLION, finish, grid
 from foretrace.evaluation.experiment import Experiment, Row, Trial
-from foretrace.evaluation.tables import markdown_table, number
 from foretrace.experiments import SUMMARIES
 from foretrace.experiments.executions import (
     FAULTS,
@@ -35,15 +34,16 @@ from foretrace.experiments.monitoring_tables import (
     CM,
     NORMAL,
     PROBES,
+    RECORDED,
     about_faults,
     about_rests,
     auroc,
     columns,
-    confusion,
     drift_after,
     is_wrong,
-    percent,
     pick,
+    recalibrated,
+    report_of,
     scores_of,
 )
 from foretrace.experiments.transfer_objects import read_silhouettes
@@ -56,9 +56,11 @@ from foretrace.objects import Prism
 from foretrace.pictures.style import new_figure, styled
 from foretrace.predictor.loading import default_checkpoint
 
+MUJOCO = "mujoco"
+"""The engine of all calibrations."""
 CHUNK = 5
 """Executions of a trial."""
-SEEDS = {CALIBRATION: SEED + 1, NORMAL: SEED + 2}
+SEEDS = {CALIBRATION: SEED + 1, NORMAL: SEED + 2, RECORDED: SEED + 4}
 """Seeds of the executions; those with faults have that of the normal ones, but draws of their own."""
 LATER = 6
 """Samples after an alarm after which its cause is asked for again."""
@@ -109,6 +111,10 @@ class Monitoring(Experiment):
     """Share of normal executions that may alarm."""
     successes: int = 200
     """Normal executions that the density of windows is learned from."""
+    engine: Literal["mujoco", "bullet"] = "mujoco"
+    """What simulates the executions; all calibration stays that on MuJoCo's."""
+    recorded: int = 60
+    """Normal executions of another engine that the monitor is then calibrated anew with."""
     silhouettes: Path | None = None
     """Folder of pictures of silhouettes, of which there are normal executions, too; without one, they are left out."""
 
@@ -118,14 +124,15 @@ class Monitoring(Experiment):
 
     def trials(self) -> Sequence[MonitoringTrial]:
         """Normal executions first."""
-        if min(self.executions, self.faults, self.successes) < 1:
+        if min(self.executions, self.faults, self.successes, self.recorded) < 1:
             raise ResultsError(
-                f"executions is {self.executions}, faults is {self.faults}, successes is {self.successes}: give at "
-                "least 1 of each"
+                f"executions is {self.executions}, faults is {self.faults}, successes is {self.successes}, recorded is "
+                f"{self.recorded}: give at least 1 of each"
             )
         known = (
             CALIBRATION,
             NORMAL,
+            *((RECORDED,) if self.engine != MUJOCO else ()),
             *(part for part in OTHERS if part != SILHOUETTES or self.silhouettes),
             *FAULTS,
         )
@@ -143,7 +150,9 @@ class Monitoring(Experiment):
         made = {"predictor": short_hash([config]), "calibration": short_hash([SHIPPED.read_bytes()])}
         own = {"false_alarms": self.false_alarms, "successes": self.successes}
         pictures = {} if self.silhouettes is None else {"silhouettes": short_hash([*self._pictures()])}
-        return {**made, "seeds": SEEDS, **own, **pictures}
+        engine = {} if self.engine == MUJOCO else {"engine": self.engine}
+        seeds = {part: seed for part, seed in SEEDS.items() if part != RECORDED or engine}
+        return {**made, "seeds": seeds, **own, **engine, **pictures}
 
     def run(self, trial: MonitoringTrial, folder: Path) -> Sequence[Row]:
         """Scores, alarms, causes and errors of executions."""
@@ -151,16 +160,19 @@ class Monitoring(Experiment):
         numbers = range(CHUNK * trial.chunk, min(CHUNK * (trial.chunk + 1), self._count(trial.part)))
         seed = SEEDS.get(trial.part, SEEDS[NORMAL])
         known = successes(self.successes, SEED + 3)
+        engine = MUJOCO if trial.part == CALIBRATION else self.engine
         draw = {OUTLINES: draw_round, SILHOUETTES: self._draw_silhouette}.get(trial.part, draw_polygon)
         return [
             watch(made, k, self.false_alarms) | {"windows": CM * unlikeness(made.tracked, known)}
-            for k, made in ((k, make_execution(seed, k, fault, draw)) for k in numbers)
+            for k, made in ((k, make_execution(seed, k, fault, draw, engine)) for k in numbers)
         ]
 
     def _count(self, part: str) -> int:
         """Number of executions of a part."""
         if part in FAULTS:
             return self.faults
+        if part == RECORDED:
+            return self.recorded
         return -(-self.executions // FEWER) if part in OTHERS else self.executions
 
     def _pictures(self) -> list[bytes]:
@@ -199,6 +211,8 @@ class Monitoring(Experiment):
             for part in OTHERS
             if (mine := table["part"] == part).any()
         }
+        if again := recalibrated(table, self.false_alarms):
+            summary["recalibrated"] = again
         summary["rest"] = about_rests(pick(table, normal))
         summary["drift"] = drift_after(table, MonitorCalibration.shipped("worlds"))
         summary["update_ms"] = float(np.median(table["update_ms"]))
@@ -207,80 +221,7 @@ class Monitoring(Experiment):
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
         """Tables of methods, faults, causes and rests."""
-        if not summary:
-            return "# Monitoring\n\nNo normal executions.\n"
-        parts = ["# Monitoring", f"{summary['normal']} normal executions."]
-        lines = [
-            [name, f"{100 * each['false_alarms']:.1f} %", percent(each["detected"]), number(each["auroc"])]
-            for name, each in summary["methods"].items()
-        ]
-        parts.append(markdown_table(["", "False alarms", "Detected", "AUROC"], lines))
-        parts += [
-            f"False alarms of the monitor, {part}: {100 * each['false_alarms']:.1f} % of {each['executions']} normal "
-            "executions."
-            for part, each in summary["others"].items()
-        ]
-        head = [
-            "Fault",
-            "Executions",
-            "AUROC",
-            "Detected",
-            "Delay, median [s]",
-            "95 %",
-            "Cause right",
-            "0.3 s later",
-            "Rest",
-        ]
-        lines = []
-        for fault, each in {**summary["faults"], "all": summary["all_faults"]}.items():
-            if each:
-                found = summary["methods"]["monitor"]
-                area = found["auroc"] if fault == "all" else found["auroc_of"][fault]
-                lines.append(
-                    [
-                        fault,
-                        str(each["executions"]),
-                        number(area),
-                        percent(each["detected"]),
-                        number(each["delay"], 2),
-                        number(each["delay_95"], 2),
-                        percent(each["cause"]),
-                        percent(each["cause_later"]),
-                        number(each["rest"], 2),
-                    ]
-                )
-        parts.append(markdown_table(head, lines))
-        parts.append(
-            "Rest: error of the re-imagined remainder at the alarm, relative to what was imagined before the motion; "
-            "medians of ratios."
-        )
-        lines = [
-            [
-                name,
-                str(each["executions"]),
-                number(each["ratio"], 2),
-                number(each["held"], 2),
-                number(each["slip"], 2),
-            ]
-            for name, each in summary["rest"].items()
-        ]
-        head = [
-            "After ten samples in motion",
-            "Executions",
-            "Error of the rest, relative",
-            "Within 90 % region",
-            "P(slip)",
-        ]
-        parts.append(markdown_table(head, lines))
-        parts.append(confusion(columns(rows)))
-        if drift := summary["drift"]:
-            parts.append(
-                f"Drift, after frictions of all executions are doubled or halved: seen after {drift['median']:.0f} "
-                f"executions (median; 95 %: {drift['p95']:.0f}); before, in {100 * drift['before']:.1f} % of 50 normal "
-                "executions in a row."
-            )
-        parts.append(f"One update: {summary['update_ms']:.2f} ms of processor time (median).")
-        return "\n\n".join(parts) + "\n"
+        return report_of(summary, columns(rows)) if summary else "# Monitoring\n\nNo normal executions.\n"
 
     @styled
     def figures(self, rows: pd.DataFrame) -> dict[str, Figure]:

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from foretrace.evaluation.tables import markdown_table
+from foretrace.evaluation.tables import markdown_table, number
 from foretrace.experiments.executions import CAUSES, FAULTS, MOVED
 from foretrace.monitoring import Drift, MonitorCalibration
 
 CM = 100.0
-NORMAL, CALIBRATION = "normal", "calibration"
+NORMAL, CALIBRATION, RECORDED = "normal", "calibration", "recorded"
 BEFORE, LONGEST, ORDERS = 50, 200, 200
 """Normal executions before a drift, most executions after it, and random orders of them."""
 PROBES = tuple(range(4, 59, 6))
@@ -123,6 +123,34 @@ def drift_after(table: Table, calibration: MonitorCalibration) -> dict[str, floa
     }
 
 
+def recalibrated(table: Table, false_alarms: float) -> dict[str, float]:
+    """What a calibration from recorded executions of the same engine is worth; and when a drift is noticed, by order.
+
+    Args:
+        table: Columns of the rows.
+        false_alarms: Share of normal executions that may alarm.
+    """
+    recorded, normal = (table["score"][table["part"] == part] for part in (RECORDED, NORMAL))
+    if len(recorded) < 1 / false_alarms:  # too few tell no such rate
+        return {}
+    shipped, noticed = MonitorCalibration.shipped("worlds"), []
+    drift = Drift(shipped)
+    for seed in range(ORDERS):
+        drift = Drift(shipped, seed=seed)
+        order = np.random.default_rng(seed).permutation(recorded)
+        seen = [drift.update(float(score)) for score in order]
+        noticed.append(seen.index(True) + 1 if any(seen) else np.inf)
+    threshold = drift.recalibrate().threshold(false_alarms)
+    return {
+        "executions": len(recorded),
+        "threshold": threshold,
+        "before": float(table["threshold"][0]),
+        "false_alarms": float(np.mean(normal > threshold)),
+        "detected": float(np.mean(table["score"][is_wrong(table)] > threshold)),
+        "noticed": float(np.median(noticed)),
+    }
+
+
 def confusion(table: Table) -> str:
     """Table of the causes that are named 0.3 s after alarms."""
     alarms = pick(table, (table["alarm"] >= 0) & is_wrong(table))
@@ -144,3 +172,86 @@ def confusion(table: Table) -> str:
 def percent(value: float | None) -> str:
     """A share as it stands in tables."""
     return "" if value is None else f"{100 * value:.0f} %"
+
+
+def report_of(summary: Mapping[str, Any], table: Table) -> str:
+    """Tables of methods, faults, causes and rests."""
+    parts = ["# Monitoring", f"{summary['normal']} normal executions."]
+    lines = [
+        [name, f"{100 * each['false_alarms']:.1f} %", percent(each["detected"]), number(each["auroc"])]
+        for name, each in summary["methods"].items()
+    ]
+    parts.append(markdown_table(["", "False alarms", "Detected", "AUROC"], lines))
+    if again := summary.get("recalibrated"):
+        parts.append(
+            f"Recalibrated on {again['executions']} normal executions of the same engine: "
+            f"{100 * again['false_alarms']:.1f} % false alarms, {percent(again['detected'])} detected, threshold "
+            f"{again['threshold']:.2f} in place of {again['before']:.2f}. Drift is noticed after "
+            f"{again['noticed']:.0f} of them (median)."
+        )
+    parts += [
+        f"False alarms of the monitor, {part}: {100 * each['false_alarms']:.1f} % of {each['executions']} normal "
+        "executions."
+        for part, each in summary["others"].items()
+    ]
+    head = [
+        "Fault",
+        "Executions",
+        "AUROC",
+        "Detected",
+        "Delay, median [s]",
+        "95 %",
+        "Cause right",
+        "0.3 s later",
+        "Rest",
+    ]
+    lines = []
+    for fault, each in {**summary["faults"], "all": summary["all_faults"]}.items():
+        if each:
+            found = summary["methods"]["monitor"]
+            area = found["auroc"] if fault == "all" else found["auroc_of"][fault]
+            lines.append(
+                [
+                    fault,
+                    str(each["executions"]),
+                    number(area),
+                    percent(each["detected"]),
+                    number(each["delay"], 2),
+                    number(each["delay_95"], 2),
+                    percent(each["cause"]),
+                    percent(each["cause_later"]),
+                    number(each["rest"], 2),
+                ]
+            )
+    parts.append(markdown_table(head, lines))
+    parts.append(
+        "Rest: error of the re-imagined remainder at the alarm, relative to what was imagined before the motion; "
+        "medians of ratios."
+    )
+    lines = [
+        [
+            name,
+            str(each["executions"]),
+            number(each["ratio"], 2),
+            number(each["held"], 2),
+            number(each["slip"], 2),
+        ]
+        for name, each in summary["rest"].items()
+    ]
+    head = [
+        "After ten samples in motion",
+        "Executions",
+        "Error of the rest, relative",
+        "Within 90 % region",
+        "P(slip)",
+    ]
+    parts.append(markdown_table(head, lines))
+    parts.append(confusion(table))
+    if drift := summary["drift"]:
+        parts.append(
+            f"Drift, after frictions of all executions are doubled or halved: seen after {drift['median']:.0f} "
+            f"executions (median; 95 %: {drift['p95']:.0f}); before, in {100 * drift['before']:.1f} % of 50 normal "
+            "executions in a row."
+        )
+    parts.append(f"One update: {summary['update_ms']:.2f} ms of processor time (median).")
+    return "\n\n".join(parts) + "\n"

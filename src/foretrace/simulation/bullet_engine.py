@@ -1,5 +1,7 @@
 """Actions and free motion in Bullet, the paper's physics engine, through pybullet."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -44,6 +46,8 @@ def play_freely(
     return world.to_object_frame(thing, poses), velocities
 
 
+Disturbance = Callable[[World, int, float], None]
+"""Does something to a body of a world at a time [s]."""
 TOUCH_MARGIN = 0.001
 """Tool and object closer than this touch [m]."""
 
@@ -85,8 +89,9 @@ class BulletEngine(Engine):
         tool_motion: ToolMotion,
         duration: float,
         physics: Physics,
+        disturb: Disturbance | None = None,
     ) -> Motion:
-        """Plays an action, step by step."""
+        """Plays an action, step by step, as `Engine.play`; a disturbance is called before each step."""
         stride = round(self.sample_period / self.timestep)
         times = np.arange(round(duration / self.sample_period) + 1) * self.sample_period
         tips = sample_tool(tool_motion, times)
@@ -104,8 +109,10 @@ class BulletEngine(Engine):
         object_pose, tool_pose = np.zeros((len(times), 7)), np.zeros((len(times), 7))
         on_tool, contacts, speed = np.zeros(len(times), dtype=bool), [], 0.0
         for i in range(len(times)):
-            for velocity in velocities[(i - 1) * stride : i * stride] if i else ():
-                world.set_velocity(held, velocity)
+            for step in range((i - 1) * stride, i * stride) if i else ():
+                world.set_velocity(held, velocities[step])
+                if disturb is not None:
+                    disturb(world, thing, step * self.timestep)
                 world.bullet.stepSimulation()
             object_pose[i], tool_pose[i] = world.pose(thing), world.pose(held)
             on_tool[i] = len(world.bullet.getClosestPoints(thing, held, TOUCH_MARGIN)) > 0

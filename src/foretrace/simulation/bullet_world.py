@@ -184,6 +184,19 @@ class World:
         self._frames[number] = np.eye(4)
         return number
 
+    def pin(self, body: int, point: Float[np.ndarray, " 3"]) -> None:
+        """Holds a point of a body's own frame [m] where it is."""
+        inside = transform_points(self._frames[body], point[None])[0]
+        here = transform_points(pose_to_matrix(self.pose(body)), point[None])[0]
+        self.bullet.createConstraint(
+            body, -1, -1, -1, self.bullet.JOINT_POINT2POINT, [0, 0, 0], inside.tolist(), here.tolist()
+        )
+
+    def push(self, body: int, force: Float[np.ndarray, " 3"]) -> None:
+        """Pushes a body at its centre of mass during the next step [N]."""
+        position, _ = self.bullet.getBasePositionAndOrientation(body)
+        self.bullet.applyExternalForce(body, -1, force.tolist(), position, self.bullet.WORLD_FRAME)
+
     def centred_pose(self, body: int) -> list[float]:
         """Pose of a body's principal axes in its centre of mass, as `to_object_frame` takes it."""
         position, (x, y, z, w) = self.bullet.getBasePositionAndOrientation(body)
