@@ -53,6 +53,38 @@ def test_polygon_to_plan_to_robot(files: Path, capsys: pytest.CaptureFixture[str
     assert "goal: Lift(" in capsys.readouterr().out
 
 
+def test_the_next_lever_up_is_chosen_by_what_it_tells(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = "plan --polygon outline.txt --goal learn --spacing 0.08 --directions 1 --refine 0"
+    assert run(command) == 0
+    assert "goal: Learn(" in capsys.readouterr().out
+    first = ft.Plan.open("plan/plan.json")
+    known = {name: (value, value) for name, value in ft.Belief().mean.items()}
+    ft.Belief(known).save("known.json")
+    assert run(f"{command} --belief known.json --out again") == 0
+    again = ft.Plan.open("again/plan.json")
+    assert again.cost == pytest.approx(0, abs=0.05)  # nothing is left to learn
+    assert first.cost < -1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--goal learn --friction 0.8", "leave out --friction"),
+        ("--goal lift --belief none.json", "none.json"),
+        ("--goal learn --unknown", "leave out --unknown"),
+        ("--goal learn --steps 2", "leave out --every and --steps"),
+        ("--goal learn --angle 0.3", "--angle goes with --goal tilt or turn"),
+    ],
+)
+def test_a_belief_in_place_of_values(
+    files: Path, capsys: pytest.CaptureFixture[str], options: str, words: str
+) -> None:
+    assert run(f"plan --polygon outline.txt {options}") == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+
+
 def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = "plan --polygon outline.txt --action push --goal move-to --position 0.09 0.06 --turn 0.6"
     assert run(f"{command} --steps 3 --spacing 0.04 --refine 1 --samples 16 --tool-friction 0.25") == 0

@@ -1,6 +1,7 @@
 """The command that chooses an action, or several in a row."""
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -8,6 +9,7 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
+from foretrace.cli.context import PhysicsOptions, option_name
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.cli.plan_many import EveryOptions, Task, plan_every
@@ -25,10 +27,10 @@ if TYPE_CHECKING:
     from foretrace.planning import Plan
 
 ActionName = Literal["lever-up", "push"]
-GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "turn", "slide-off"]
+GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "turn", "slide-off", "learn"]
 BELONGS: dict[str, tuple[GoalName, ...]] = {
     "max_slip": ("lift", "tilt", "move"),
-    "at_least": ("lift", "move"),
+    "at_least": ("lift", "move", "learn"),
     "angle": ("tilt", "turn"),
     "edge": ("turn-over",),
     "direction": ("turn-over", "move"),
@@ -58,7 +60,7 @@ class GoalOptions:
     max_slip: float | None = None
     """Largest probability of a slip that is accepted: 0.05 by default for lift and tilt, any for move."""
     at_least: float | None = None
-    """Rise or distance from which on the goal counts as reached [m]; 0.01 by default."""
+    """Rise or distance from which on the goal counts as reached [m], 0.01 by default; or information [nat], 0.5."""
     angle: float | None = None
     """Angle to tilt to, or to turn by about the vertical [rad]."""
     edge: int | None = None
@@ -92,9 +94,9 @@ class GoalOptions:
         for name in given:
             if self.goal not in BELONGS[name]:
                 raise PlanningError(
-                    f"{_option(name)} goes with --goal {' or '.join(BELONGS[name])}: leave it out"
+                    f"{option_name(name)} goes with --goal {' or '.join(BELONGS[name])}: leave it out"
                 )
-        if missing := [_option(name) for name in NEEDED.get(self.goal, ()) if name not in given]:
+        if missing := [option_name(name) for name in NEEDED.get(self.goal, ()) if name not in given]:
             raise PlanningError(f"--goal {self.goal} needs {' and '.join(missing)}")
         if self.goal == "turn-over" and len(given) != 1:
             raise PlanningError("--goal turn-over needs either --edge or --direction")
@@ -118,18 +120,6 @@ class PlaceOptions:
     """JSON file with the calibrated pose of the arm's base in the table frame: only what the arm reaches is planned."""
     speed: float = 0.1
     """Share of the tool path's own speed at which the arm is checked, at most 1."""
-
-
-@dataclass(frozen=True)
-class PhysicsOptions:
-    """Constants that the imaginers are told."""
-
-    friction: float | None = None
-    """Friction of object and table."""
-    tool_friction: float | None = None
-    """Friction of object and blade."""
-    density: float | None = None
-    """Density of the object [kg/m^3]."""
 
 
 @adapt((PhotoConfig, ("height",)))
@@ -175,22 +165,13 @@ def plan(
         _refuse_with_every(obj, photo, where, steps)
         seen = thing = T_table_object = None
     else:
-        if idle := [_option(name) for name in ("workers", "cluster") if getattr(many, name) is not None]:
+        if idle := [option_name(name) for name in ("workers", "cluster") if getattr(many, name) is not None]:
             raise PlanningError(f"{' and '.join(idle)} without --every: leave it out")
         seen, thing, T_table_object = _observe(obj, photo, where)
-    given = {name: value for name, value in asdict(physics).items() if value is not None}
-    for name, value in given.items():
-        if not 0 < value < float("inf"):
-            raise PlanningError(f"{_option(name)} is {value}: give a number above 0")
     predictor = imaginer_of(run, action, steps)
-    if idle := [_option(name) for name in given if name not in predictor.context]:
-        raise PlanningError(
-            f"{' and '.join(idle)}: the {predictor.name} imaginer is not conditioned on it, leave it out"
-        )
-    told: Any = None
-    if given or unknown:
-        usual = {} if unknown else dict(predictor.nominal)
-        told = {name: value for name, value in (usual | given).items() if name in predictor.context}
+    told = physics.context(predictor, aim.goal == "learn", unknown)
+    if not isinstance(told, Mapping | None) and (many.every or steps != 1):
+        raise PlanningError("a belief is about one object and its next action: leave out --every and --steps")
     if thing is None:
         task = Task(run, action, goal, told, search)
         plan_every(as_place(where.data, DatasetError), task, out, many)
@@ -203,7 +184,7 @@ def plan(
         goal,
         predictor,
         told,
-        config=search,
+        config=None if search == PlanConfig() else search,  # a goal's own
         T_table_object=T_table_object,
         reach=_reach(where, T_table_object),
     )
@@ -235,7 +216,7 @@ def _refuse_with_every(obj: ObjectOptions, photo: PhotoOptions, where: PlaceOpti
     one |= {"steps"} if steps != 1 else set()
     if one:
         raise PlanningError(
-            f"--every plans for many objects: leave out {' and '.join(map(_option, sorted(one)))}, or --every"
+            f"--every plans for many objects: leave out {' and '.join(map(option_name, sorted(one)))}, or --every"
         )
 
 
@@ -381,7 +362,3 @@ def _reach(where: PlaceOptions, T_table_object: np.ndarray | None) -> Any:
     from foretrace.robot.reach import ArmReach
 
     return ArmReach(read_base_pose(where.base), T_table_object, where.speed)
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
