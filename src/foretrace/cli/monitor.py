@@ -1,12 +1,15 @@
-"""The command that watches a recorded action as a monitor would have watched it."""
+"""The command that watches an action, recorded or under way, with a monitor."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from foretrace.cli.console import say
 from foretrace.errors import DatasetError, MonitoringError
 from foretrace.files import atomic_path, make_folder
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
@@ -19,6 +22,8 @@ from foretrace.pictures.watched import monitor_figure, monitor_film
 from foretrace.planning import Plan
 from foretrace.predictor import load_imaginer
 
+Sample = tuple[float, Float[np.ndarray, "7"] | None]
+"""Time since the beginning of the action [s], and a pose; None where the object was lost."""
 PICTURES, FILMS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
@@ -38,6 +43,20 @@ class TrackOptions:
     """Time at which the action began, by the clock of the poses [s]; by default that of the first one."""
 
 
+@dataclass(frozen=True)
+class CameraOptions:
+    """A camera that films the object while a plan is carried out (experimental)."""
+
+    camera: str | None = None
+    """Number of a camera for OpenCV; or a video, or a folder of frames, which stands for one."""
+    markers: Path | None = None
+    """Marker layout of table and object."""
+    intrinsics: Path | None = None
+    """The camera's file, as `calibrate` writes it."""
+    delay: float = 0.0
+    """Time from the first image to the beginning of the action [s]."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Watched:
     """What happened, and what a monitor said of it."""
@@ -55,6 +74,7 @@ def monitor(
     *,
     out: Path,
     track: OmitArgPrefixes[TrackOptions] = TrackOptions(),
+    live: Annotated[OmitArgPrefixes[CameraOptions], arg(name="camera")] = CameraOptions(),
     run: Path | None = None,
     false_alarms: float = 0.05,
     calibration: Path | None = None,
@@ -62,7 +82,8 @@ def monitor(
 ) -> None:
     """Watch a recorded or simulated action, sample by sample, as a monitor would have watched it under way.
 
-    It is an interaction of a data set, or a plan with the poses that a tracker recorded while it was carried out.
+    It is an interaction of a data set, or a plan with the poses that a tracker recorded while it was carried out. With
+    --camera, a plan is watched while it is carried out (experimental: never tried with a camera).
 
     Writes an image of the score over time with its threshold, of the outcomes' probabilities, and of the height as
     imagined and observed, or a film in which the object moves beside them, with its expected edges; and prints when
@@ -73,6 +94,7 @@ def monitor(
         id: Number of the interaction.
         out: The image to write: .png, .svg or .pdf; or the film: .gif or .mp4.
         track: Poses, for a plan.
+        live: Camera, for a plan.
         run: Folder of the training; by default the predictor that comes with foretrace.
         false_alarms: Share of whole normal executions that may alarm.
         calibration: File of another calibration than the one that comes with foretrace.
@@ -84,14 +106,16 @@ def monitor(
         )
     belief = Belief(worlds=worlds)
     if data.suffix.lower() == ".json":
-        if id is not None or track.poses is None:
-            raise MonitoringError(f"{data} is a plan: give --poses FILE, and no number of an interaction")
-        watched = _watch_plan(data, track, run, belief, false_alarms, calibration)
-    else:
-        if id is None or track != TrackOptions():
+        if id is not None or (track.poses is None) == (live.camera is None):
             raise MonitoringError(
-                f"{data} is a data set: give the number of an interaction, and no options of poses, which belong to a "
-                "plan.json"
+                f"{data} is a plan: give --poses FILE or --camera, and no number of an interaction"
+            )
+        watched = _watch_plan(data, track, live, run, belief, false_alarms, calibration)
+    else:
+        if id is None or track != TrackOptions() or live != CameraOptions():
+            raise MonitoringError(
+                f"{data} is a data set: give the number of an interaction, and no options of poses or of a camera, "
+                "which belong to a plan.json"
             )
         watched = _watch_interaction(data, id, run, belief, false_alarms, calibration)
     make_folder(out.parent, MonitoringError)
@@ -132,35 +156,49 @@ def _watch_interaction(
 def _watch_plan(
     file: Path,
     track: TrackOptions,
+    live: CameraOptions,
     run: Path | None,
     belief: Belief,
     false_alarms: float,
     calibration: Path | None,
 ) -> _Watched:
-    assert track.poses is not None
     plan = Plan.open(file)
-    T_table_action = plan.T_table_action if track.table else None
-    if track.table and T_table_action is None:
+    filmed = live.camera is not None
+    T_table_action = plan.T_table_action if track.table or filmed else None
+    if (track.table or filmed) and T_table_action is None:
         raise MonitoringError(
             f"{file} does not say where the object lies on the table: plan with --pose or --photo, or give poses in "
             "the action frame"
         )
-    times, poses = _poses_since_start(track, plan.action.duration)
-    lost = np.isnan(poses[:, 0])
     imaginer = load_imaginer(run)
     if not isinstance(plan.action, imaginer.action):
         raise MonitoringError(
             f"{file} plans a {plan.action.label}, and the {imaginer.name} predictor imagines a "
             f"{imaginer.action.label}: give --run with one of a {plan.action.label}, or use ft.Monitor in Python"
         )
+    source = track.poses.name if track.poses else f"camera {live.camera}"
+    samples = (
+        _filmed(live, plan.action.duration) if filmed else _poses_since_start(track, plan.action.duration)
+    )
     plan = plan.imagined_by(imaginer, belief)
     watching = Monitor(plan, false_alarms, T_table_action=T_table_action, calibration=calibration)
-    verdicts = [
-        watching.update(float(t), None if gone else pose)
-        for t, pose, gone in zip(times, poses, lost, strict=True)
-    ]
+    times, poses, verdicts = [], [], []
+    for t, pose in samples:
+        verdict = watching.update(t, pose)
+        if filmed and verdict.alarm and not (verdicts and verdicts[-1].alarm):
+            say(f"alarm at {t:.2f} s: {verdict.cause}")
+        times.append(t)
+        poses.append(np.full(7, np.nan) if pose is None else pose)
+        verdicts.append(verdict)
+    times, poses = np.array(times), np.array(poses).reshape(-1, 7)
+    lost = np.isnan(poses[:, 0])
+    if (~lost).sum() < 2:
+        raise MonitoringError(
+            f"{source}: the object is seen in {(~lost).sum()} images while the action lasts: check --markers, light "
+            "and --delay"
+        )
     if (first := verdicts[int(np.argmin(lost))]).cause == BAD_INPUT:
-        raise MonitoringError(f"{track.poses}, first pose: {first.message}")
+        raise MonitoringError(f"{source}, first pose: {first.message}")
     # Whichever frame of the object is tracked: it has moved from where the plan saw the object at rest.
     seen = pose_to_matrix(poses[np.maximum.accumulate(np.where(lost, np.argmin(lost), np.arange(len(lost))))])
     if T_table_action is not None:
@@ -169,14 +207,40 @@ def _watch_plan(
     rest, middle = plan.action.T_action_object, plan.imagined.com_trajectory[:1]
     com = np.array([transform_points(each, middle)[0] for each in moved])
     scene = Scene.imagined(plan.shown_object, plan.action, times, {}, matrix_to_pose(moved @ rest))
-    scene = replace(scene, com=com, title=f"{plan.goal}: {track.poses.name}")
+    scene = replace(scene, com=com, title=f"{plan.goal}: {source}")
     return _Watched(scene, plan.imagined, verdicts, np.where(lost[:, None], np.nan, com))
 
 
-def _poses_since_start(
-    track: TrackOptions, duration: float
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 7"]]:
-    """Times since the beginning of an action [s], and poses from then on, NaN where the object was lost.
+def _filmed(live: CameraOptions, duration: float) -> Iterator[Sample]:
+    """Times since the beginning of an action [s], and poses in the table frame as they come.
+
+    Raises:
+        PerceptionError: The camera or a file cannot be used.
+        MonitoringError: A file is not named, or the delay is none.
+    """
+    from foretrace.interactions.pinhole import PinholeCamera
+    from foretrace.perception.live import LiveTracker, live_frames
+    from foretrace.perception.markers import MarkerLayout
+
+    if live.markers is None or live.intrinsics is None:
+        raise MonitoringError("--camera needs --markers and --intrinsics: give both files")
+    if not 0 <= live.delay < np.inf:
+        raise MonitoringError(
+            f"--delay is {live.delay}: give the seconds before the action begins, from 0 on"
+        )
+    tracker = LiveTracker(PinholeCamera.load(live.intrinsics), MarkerLayout.load(live.markers))
+    begin = None
+    for frame in live_frames(str(live.camera)):
+        begin = frame.time + live.delay if begin is None else begin
+        if (now := frame.time - begin) > duration:
+            return
+        T = tracker.update(frame.time, frame.image)
+        if now >= 0:
+            yield now, None if T is None else matrix_to_pose(T)
+
+
+def _poses_since_start(track: TrackOptions, duration: float) -> Iterator[Sample]:
+    """Times since the beginning of an action [s], and poses from then on.
 
     Raises:
         PerceptionError: The file cannot be read.
@@ -201,4 +265,5 @@ def _poses_since_start(
             f"{track.poses} has {poses_are} within the {duration:.1f} s that the action takes from {start:.15g} on: "
             "give times in seconds, and poses while it runs"
         )
-    return times, poses
+    for t, pose in zip(times.tolist(), poses, strict=True):
+        yield t, None if np.isnan(pose[0]) else pose
