@@ -313,7 +313,8 @@ def _panel(ax: Any, found: Mapping[str, Any]) -> None:
             continue
         at = [counts.index(count) for count in errors]
         mean = np.array([one["mean"] for one in errors.values()])
-        apart = np.abs(np.array([[one["low"], one["high"]] for one in errors.values()]) - mean[:, None]).T
+        ends = np.array([[one["low"], one["high"]] for one in errors.values()], dtype=float)  # None: one draw
+        apart = np.nan_to_num(np.abs(ends - mean[:, None])).T
         ax.errorbar(at, mean, apart, fmt="o-", color=METHODS[method], label=method)
     ax.set_xticks(range(len(counts)), [str(count) for count in counts])
     ax.set_ylim(bottom=0)
