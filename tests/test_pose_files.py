@@ -207,7 +207,7 @@ def test_a_plan_is_watched_through_a_camera(recorded, tmp_path: Path, capsys, mo
 
 
 def test_a_live_tracker_is_as_good_as_the_film_is_sharp(recorded):
-    """From the first fifth of a second on, within a millimetre and half a degree, without what comes after."""
+    """From the first fifth of a second on, within 1.5 mm and half a degree, without what comes after."""
     folder, truth = recorded
     tracker = LiveTracker(
         PinholeCamera.load(folder / "camera.json"), MarkerLayout.load(folder / "markers.json")

@@ -1,5 +1,6 @@
 """Options that say what imaginers are told: values of constants, or a belief."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,7 +9,6 @@ from foretrace.errors import PlanningError
 
 if TYPE_CHECKING:
     from foretrace.imagined import Belief, Imaginer
-    from foretrace.imagined.context import Context
 
 CONSTANTS = ("friction", "tool_friction", "density")
 """Options that are constants."""
@@ -28,7 +28,9 @@ class PhysicsOptions:
     """File of a belief about the constants, as `Belief.save` writes it, in place of their values; with --goal learn, by
     default what is believed before the first action."""
 
-    def context(self, imaginer: "Imaginer", learns: bool, unknown: bool) -> "Context | Belief":
+    def context(
+        self, imaginer: "Imaginer", learns: bool, unknown: bool
+    ) -> "Mapping[str, float] | Belief | None":
         """What an imaginer is told.
 
         Args:

@@ -170,14 +170,15 @@ def plan(
         seen, thing, T_table_object = _observe(obj, photo, where)
     predictor = imaginer_of(run, action, steps)
     told = physics.context(predictor, aim.goal == "learn", unknown)
-    if not isinstance(told, Mapping | None) and (many.every or steps != 1):
-        raise PlanningError("a belief is about one object and its next action: leave out --every and --steps")
-    if thing is None:
-        task = Task(run, action, goal, told, search)
-        plan_every(as_place(where.data, DatasetError), task, out, many)
-        return
-    if steps != 1:
-        _plan_several(thing, goal, steps, predictor, told, search, where, out)
+    if thing is None or steps != 1:
+        if not isinstance(told, Mapping | None):
+            raise PlanningError(
+                "a belief is about one object and its next action: leave out --every and --steps"
+            )
+        if thing is None:
+            plan_every(as_place(where.data, DatasetError), Task(run, action, goal, told, search), out, many)
+        else:
+            _plan_several(thing, goal, steps, predictor, told, search, where, out)
         return
     found = choose(
         thing,

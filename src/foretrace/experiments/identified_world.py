@@ -193,7 +193,7 @@ class IdentifiedWorld(Experiment):
         for found, values in rows.groupby(keys, sort=False)["value"]:
             world, imaginer, method, count, metric = map(str, found)  # pyright: ignore[reportArgumentType]
             place = summary.setdefault(world, {}).setdefault(imaginer, {}).setdefault(method, {})
-            place.setdefault(count, {})[metric] = bootstrap(values).as_dict(5)
+            place.setdefault(count, {})[metric] = bootstrap(np.asarray(values)).as_dict(5)
         return summary
 
     def report(self, summary: Mapping[str, Any], rows: pd.DataFrame) -> str:
@@ -306,12 +306,12 @@ def _constants(found: Mapping[str, Any]) -> str:
 def _panel(ax: Any, found: Mapping[str, Any]) -> None:
     """Errors of the methods of one imaginer in one world."""
     counts = sorted({int(count) for each in found.values() for count in each if int(count)})
-    for method, each in found.items():
+    for k, (method, each) in enumerate(found.items()):
         errors = {int(count): one["error"] for count, one in each.items()}
         if 0 in errors:
             ax.axhline(errors[0]["mean"], color=METHODS[method], linestyle="--", label=method)
             continue
-        at = [counts.index(count) for count in errors]
+        at = [counts.index(count) + 0.05 * (k - 3) for count in errors]  # beside each other
         mean = np.array([one["mean"] for one in errors.values()])
         ends = np.array([[one["low"], one["high"]] for one in errors.values()], dtype=float)  # None: one draw
         apart = np.nan_to_num(np.abs(ends - mean[:, None])).T
