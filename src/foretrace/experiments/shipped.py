@@ -204,7 +204,7 @@ class Shipped(Experiment):
                 mine = rows[rows["part"].eq(part) & rows["start"].eq(start) & rows["context"].eq(context)]
                 mine = mine[mine["imaginer"].eq("shipped")].set_index("metric")["value"]
                 shown = mine.reindex([f"held_{level:g}" for level in SHOWN_LEVELS])
-                if shown.notna().any():
+                if np.isfinite(shown.to_numpy(float)).any():
                     ax.plot(SHOWN_LEVELS, shown, "o-", color=color, label=f"start {start}, context {context}")
             ax.set_title(part.capitalize())
             ax.set_xlabel("level of the region")

@@ -115,9 +115,8 @@ def rows_of_twins(folder: Path) -> pd.DataFrame:
     """
     rows = read_rows(folder, TwinTrial)
     rows = rows[rows["metric"].isin(PAPER_METRICS) & rows["imaginer"].ne("one-shot")]
-    rows = rows.assign(
-        features=rows["imaginer"], setting=rows["part"], metric=rows["metric"].map(PAPER_METRICS)
-    )
+    metrics = [PAPER_METRICS[name] for name in rows["metric"]]
+    rows = rows.assign(features=rows["imaginer"], setting=rows["part"], metric=metrics)
     shuffled, novel = rows[rows["part"].eq("shuffled")], rows[rows["part"].isin(CORNERS)]
     unlearned = shuffled[shuffled["imaginer"].isin(TWINS)]
     parts = [
@@ -125,7 +124,7 @@ def rows_of_twins(folder: Path) -> pd.DataFrame:
         novel.assign(experiment="novel-corners"),
         *(unlearned.assign(experiment="training-size", setting=size) for size in SIZES),
     ]
-    return pd.concat(parts)[["experiment", "features", "seed", "setting", "metric", "value"]]
+    return pd.concat(parts).drop(columns=["part", "imaginer"])
 
 
 @dataclass(frozen=True)
