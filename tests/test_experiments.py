@@ -86,7 +86,7 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
                               "subjects": (PENTAGON_EDGE, replace(PENTAGON_EDGE, group="everyday", hull=True))},
     "non-flat": lambda root: {"data": root / "solids", "seeds": (0,), "splits": ("by-outline",), "probes": 1,
                               "recipe": QUICK["lstm"].change(features="im-cnn")},
-    "twin": lambda root: {"data": root / "plain", "everyday": root / "solids", "parts": ("shuffled", "not-flat"),
+    "twin": lambda root: {"data": root / "blade", "everyday": root / "solids", "parts": ("shuffled", "not-flat"),
                           "imaginers": ("twin", "residual", "one-shot"), "proportional": True,
                           "recipe": QUICK["one-shot"]},
     "other-world": lambda root: {"data": root / "blade", "lever_ups": (0, 6), "seeds": (0,), "proportional": True,
