@@ -377,11 +377,11 @@ def ranges_of(measures: Mapping[str, Float[np.ndarray, " batch"]]) -> dict[str, 
 
 def wider(first: Ranges, second: Ranges) -> dict[str, tuple[float, float]]:
     """Ranges that hold those of both."""
-    both = {**first, **second}
-    return {
-        name: (min(low, first.get(name, (low,))[0]), max(high, first.get(name, (high,))[-1]))
-        for name, (low, high) in both.items()
-    }
+    found = dict(first)
+    for name, (low, high) in second.items():
+        own = first.get(name, (low, high))
+        found[name] = min(low, own[0]), max(high, own[1])
+    return found
 
 
 def known_ranges(found: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:

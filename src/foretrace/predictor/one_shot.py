@@ -294,25 +294,16 @@ class OneShotPredictor(EffectPredictor):
         A predictor that was trained before keeps its covariance: few actions tell little about it.
         """
         if not self.fine_tuned:
-            self._fit_covariance(features, effects, other_features, other_effects)
+            features, effects = _some(features, effects)
+            residuals, other_residuals = (
+                torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
+                for part in ((features, effects), (other_features, other_effects))
+            )
+            for outcome in range(len(self.outcomes)):
+                mine = residuals[effects.outcomes == outcome]
+                others = other_residuals[other_effects.outcomes == outcome]
+                self.covariance[outcome] = fit_covariance(mine if len(mine) else residuals, others)
         self.calibrate(other_features, other_effects)
-
-    def _fit_covariance(
-        self,
-        features: Float[Tensor, "batch inputs"],
-        effects: Effects,
-        other_features: Float[Tensor, "other inputs"],
-        other_effects: Effects,
-    ) -> None:
-        features, effects = _some(features, effects)
-        residuals, other_residuals = (
-            torch.cat([self._residuals(*piece) for piece in _pieces(*part)])
-            for part in ((features, effects), (other_features, other_effects))
-        )
-        for outcome in range(len(self.outcomes)):
-            mine = residuals[effects.outcomes == outcome]
-            others = other_residuals[other_effects.outcomes == outcome]
-            self.covariance[outcome] = fit_covariance(mine if len(mine) else residuals, others)
 
     def calibrate(self, features: Float[Tensor, "batch inputs"], effects: Effects) -> None:
         """Fit temperatures and quantiles to a part that the networks have not learned from."""
