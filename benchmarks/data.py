@@ -2,17 +2,20 @@
 
     python benchmarks/data.py --rows 1000000        # 10 GB, and half an hour to make
 
-A few hundred lever-ups are simulated; the others are copies with numbers, seeds and paths of their own. Every time is
-measured in a process of its own, whose peak memory is noted as well.
+A few hundred lever-ups are simulated; the others are copies with numbers, seeds and paths of their own, written as
+simulated ones are. Every measurement is made in a process of its own, whose peak memory is noted as well: elapsed time,
+and processor time, which says more where other processes wait for the same cores.
 """
 
 import json
 import os
 import random
 import resource
+import shutil
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,15 +28,22 @@ from rich.console import Console
 
 import foretrace as ft
 from foretrace.files import write_json
-from foretrace.interactions import storage
-from foretrace.interactions.dataset import INDEX_COLUMNS
+from foretrace.interactions import index, shards, storage
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.randomisation import RANDOMISED
 
 ROOT = Path(__file__).parents[1]
 BATCHES, BATCH = 20, 100
 """Rows of the epoch that is timed; the rest is extrapolated."""
-ACCESSES = 50
+ACCESSES = 200
+CONFIG = CollectConfig(
+    24, recipe="all", simulation=ft.SimulationConfig(embodiment="tool"), randomisation=RANDOMISED
+)
+TASKS = {
+    "first_opening": "open",
+    **{name: name for name in ("open", "list", "filter", "access", "epoch", "grown", "repeat")},
+}
+"""What is measured, by its name in the results."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +52,8 @@ class Options:
 
     rows: int = 200_000
     """Interactions."""
+    aged_rows: int = 20_000
+    """Interactions of which the first opening is timed without indices in the shards, too."""
     layout_rows: int = 5_000
     """Interactions that the layouts are compared on."""
     folder: Path = ROOT / "build" / "data"
@@ -50,6 +62,8 @@ class Options:
     """File of the results."""
     task: str = ""
     """One measurement, in this process."""
+    measured: Path = Path()
+    """Folder of the data set that it is of."""
 
 
 def make(options: Options) -> Path:
@@ -58,10 +72,7 @@ def make(options: Options) -> Path:
     if (folder / storage.MANIFEST).is_file():
         return folder
     base = options.folder / "base"
-    config = CollectConfig(
-        24, recipe="all", simulation=ft.SimulationConfig(embodiment="tool"), randomisation=RANDOMISED
-    )
-    collect(config, base, console=Console(quiet=True))
+    collect(CONFIG, base, console=Console(quiet=True))
     table = ft.Dataset.open(base, failed=True).table.combine_chunks()
     (folder / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
     rng, entries = random.Random(0), {}
@@ -80,58 +91,107 @@ def make(options: Options) -> Path:
         for name, values in columns.items():
             part = part.set_column(part.column_names.index(name), name, values)
         name = storage.shard_name(number)
-        entries[name] = storage.write_shard(folder, name, part)
+        entries[name] = shards.write_shard(folder, name, part)
     manifest = storage.read_manifest(base)
     fresh = storage.new_manifest(manifest["configuration"], options.rows, 100, manifest["versions"])
     storage.write_manifest(folder, fresh | {"shards": entries})
     return folder
 
 
-def measure(task: str, folder: Path, options: Options) -> dict[str, Any]:
+def beginning(folder: Path, rows: int, aged: bool) -> Path:
+    """The first rows of the data set as one of their own; aged: without indices in its shards."""
+    part = folder.parent / f"{'aged' if aged else 'part'}-{rows}"
+    (part / storage.SHARD_FOLDER).mkdir(parents=True, exist_ok=True)
+    manifest = storage.read_manifest(folder)
+    entries = {}
+    for name in map(storage.shard_name, range(rows // 100)):
+        table, content = storage.read_shard(folder, name)
+        if aged:
+            pq.write_table(table, part / name, compression="zstd", use_dictionary=False)
+            content = (part / name).read_bytes()
+        (part / name).write_bytes(content)
+        entries[name] = storage.shard_entry(content, table)
+    storage.write_manifest(part, manifest | {"num_trials": rows, "shards": entries})
+    return part
+
+
+class Laps:
+    """Seconds since the last call, elapsed and of the processor."""
+
+    def __init__(self):
+        self.found: dict[str, Any] = {}
+        self._begun = time.perf_counter(), time.process_time()
+
+    def __call__(self, name: str = "", times: float = 1.0) -> None:
+        """Note the seconds, times a factor, under a name."""
+        spent = (time.perf_counter() - self._begun[0], time.process_time() - self._begun[1])
+        if name:
+            self.found |= {
+                f"{name}{kind}_s": round(times * s, 4) for kind, s in zip(("", "_cpu"), spent, strict=True)
+            }
+        self._begun = time.perf_counter(), time.process_time()
+
+
+def measure(task: str, folder: Path) -> dict[str, Any]:
     """One measurement."""
-    begun = time.perf_counter()
-    rng = np.random.default_rng(0)
-
-    def lap() -> float:
-        nonlocal begun
-        seconds, begun = time.perf_counter() - begun, time.perf_counter()
-        return round(seconds, 4)
-
-    if task == "open":
-        found: dict[str, Any] = {"rows": len(ft.Dataset.open(folder)), "open_s": lap()}
-    elif task == "filter":
-        dataset = ft.Dataset.open(folder)
-        lap()
-        found = {"levered": len(dataset.where(outcome="levered")), "filter_outcome_s": lap()}
-        found |= {
-            "friction": len(dataset.where(friction=lambda value: value > 0.5)),
-            "filter_friction_s": lap(),
-        }
-        found |= {
-            "insertion": len(dataset.where(insertion=lambda value: value > 0.015)),
-            "filter_insertion_s": lap(),
-        }
-    elif task == "access":
-        dataset = ft.Dataset.open(folder)
-        rows = rng.choice(len(dataset), ACCESSES)
-        lap()
-        for row in rows:
-            dataset[int(row)]
-        found = {"random_access_ms": round(1000 * lap() / ACCESSES, 2)}
-    elif task == "epoch":
-        dataset = ft.Dataset.open(folder)
-        _ = dataset[: BATCHES * BATCH].times
-        lap()
-        read = sum(len(batch) for batch in dataset[: BATCHES * BATCH].batches(BATCH))
-        found = {"read": read, "epoch_s_per_1000": round(1000 * lap() / (BATCHES * BATCH), 3)}
+    laps = Laps()
+    if task == "repeat":  # of a command that has nothing left to do
+        laps.found["outcomes"] = collect(CONFIG, folder, console=Console(quiet=True))
+        laps("repeat")
+    elif task == "grown":
+        manifest = storage.read_manifest(folder)
+        fewer = dict(list(manifest["shards"].items())[: -max(1, len(manifest["shards"]) // 100)])
+        storage.write_manifest(folder, manifest | {"shards": fewer})
+        with warnings.catch_warnings(action="ignore"):  # it is not finished
+            laps.found["before"] = len(ft.Dataset.open(folder))
+        storage.write_manifest(folder, manifest)
+        laps()
+        laps.found["rows"] = len(ft.Dataset.open(folder))
+        laps("open")
     else:
-        return layouts(folder, options)
-    return found | {"peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
+        read(task, folder, laps)
+    return laps.found | {"peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
+
+
+def read(task: str, folder: Path, laps: Laps) -> None:
+    """One measurement of a data set that is opened first."""
+    dataset = ft.Dataset.open(folder)
+    if task == "open":
+        laps.found["rows"] = len(dataset)
+        laps("open")
+    laps()
+    if task == "list":
+        laps.found["shown"] = repr(dataset).partition(": ")[2].rstrip(")")
+        laps.found["objects"] = len(np.unique(dataset.index["object_id"]))
+        laps("list")
+    elif task == "filter":
+        laps.found["levered"] = len(dataset.where(outcome="levered"))
+        laps("filter_outcome")
+        for name, least in (("friction", 0.5), ("insertion", 0.015)):
+            laps.found[name] = len(dataset.where(**{name: lambda value, least=least: value > least}))
+            laps(f"filter_{name}")
+    elif task == "access":
+        for row in np.random.default_rng(0).choice(len(dataset), ACCESSES):
+            dataset[int(row)]
+        laps("random_access", 1 / ACCESSES)
+    elif task == "epoch":
+        _ = dataset[: BATCHES * BATCH].times
+        laps()
+        laps.found["read"] = sum(len(batch) for batch in dataset[: BATCHES * BATCH].batches(BATCH))
+        laps("epoch_of_1000", 1000 / (BATCHES * BATCH))
+
+
+def apart(task: str, folder: Path) -> dict[str, Any]:
+    """One measurement, in a process of its own."""
+    words = [sys.executable, __file__, "--task", task, "--measured", str(folder)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    print(task, done.stdout.strip(), flush=True)
+    return json.loads(done.stdout)
 
 
 def layouts(folder: Path, options: Options) -> dict[str, Any]:
     """Images and trajectories in three layouts: shards, an episode a row group (LeRobot v3), mapped Arrow."""
-    shards = [folder / storage.shard_name(k) for k in range(options.layout_rows // 100)]
+    files = [folder / storage.shard_name(k) for k in range(options.layout_rows // 100)]
     names = ["com_trajectory", "pose_trajectory", "mask", "height"]
     episodes, mapped = options.folder / "episodes.parquet", options.folder / "mapped.arrow"
     schema = pa.schema([storage.SCHEMA.field(name) for name in names])
@@ -139,12 +199,12 @@ def layouts(folder: Path, options: Options) -> dict[str, Any]:
         pq.ParquetWriter(episodes, schema, compression="zstd") as rows,
         pa.ipc.new_file(str(mapped), schema) as arrow,
     ):
-        for shard in shards:
-            table = pq.read_table(shard, columns=names)
+        for file in files:
+            table = pq.read_table(file, columns=names)
             arrow.write_table(table)
             for k in range(len(table)):
                 rows.write_table(table.slice(k, 1), row_group_size=1)
-    chosen = np.random.default_rng(0).choice(100 * len(shards), ACCESSES)
+    chosen = np.random.default_rng(0).choice(100 * len(files), ACCESSES)
     found: dict[str, Any] = {}
 
     def timed(name: str, size: int, begin, row, everything) -> None:
@@ -158,8 +218,8 @@ def layouts(folder: Path, options: Options) -> dict[str, Any]:
         found[name] = {
             "open_ms": round(1000 * (middle - start), 2),
             "random_access_ms": round(1000 * (end - middle) / ACCESSES, 3),
-            "epoch_s_per_1000": round(1000 * (time.perf_counter() - end) / (100 * len(shards)), 4),
-            "kb_per_row": round(size / (100 * len(shards)) / 1000, 2),
+            "epoch_s_per_1000": round(1000 * (time.perf_counter() - end) / (100 * len(files)), 4),
+            "kb_per_row": round(size / (100 * len(files)) / 1000, 2),
         }
 
     def touch(table: pa.Table) -> None:
@@ -175,11 +235,11 @@ def layouts(folder: Path, options: Options) -> dict[str, Any]:
 
     timed(
         "shards of 100 rows",
-        sum(column_bytes(shard, names) for shard in shards),
-        lambda: shards,
-        lambda files, k: touch(pq.read_table(files[k // 100], columns=names).slice(k % 100, 1)),
-        lambda files: [
-            storage.unpack_heights(pq.read_table(f, columns=names)["height"].to_pylist()) for f in files
+        sum(column_bytes(file, names) for file in files),
+        lambda: files,
+        lambda opened, k: touch(pq.read_table(opened[k // 100], columns=names).slice(k % 100, 1)),
+        lambda opened: [
+            storage.unpack_heights(pq.read_table(f, columns=names)["height"].to_pylist()) for f in opened
         ],
     )
     timed(
@@ -189,7 +249,7 @@ def layouts(folder: Path, options: Options) -> dict[str, Any]:
         lambda file, k: touch(file.read_row_group(k)),
         lambda file: [
             storage.unpack_heights(file.read_row_groups(range(k, k + 100))["height"].to_pylist())
-            for k in range(0, 100 * len(shards), 100)
+            for k in range(0, 100 * len(files), 100)
         ],
     )
     timed(
@@ -212,43 +272,33 @@ def column_bytes(shard: Path, names: list[str]) -> int:
 
 def sizes(folder: Path) -> dict[str, float]:
     """Bytes of each column per interaction, on disk."""
-    shards = [folder / storage.shard_name(k) for k in range(10)]
-    each = {name: sum(column_bytes(s, [name]) for s in shards) / 1000 for name in storage.SCHEMA.names}
+    files = [folder / storage.shard_name(k) for k in range(10)]
+    each = {name: sum(column_bytes(file, [name]) for file in files) / 1000 for name in storage.SCHEMA.names}
     large = {
         name: round(value) for name, value in sorted(each.items(), key=lambda pair: -pair[1]) if value > 50
     }
-    whole = sum(s.stat().st_size for s in shards) / 1000
+    whole = sum(file.stat().st_size for file in files) / 1000
+    footers = (pq.read_metadata(file).metadata[shards.FOOTER] for file in files)
+    large["index"] = round(sum(map(len, footers)) / 1000)
     return {"all": round(whole), **large, "others": round(whole - sum(large.values()))}
 
 
 def main(options: Options) -> None:
     """Make the data set, and measure."""
-    folder = make(options)
     if options.task:
-        print(json.dumps(measure(options.task, folder, options)))
+        print(json.dumps(measure(options.task, options.measured)))
         return
+    folder = make(options)
     results: dict[str, Any] = {"rows": options.rows, "bytes_per_interaction": sizes(folder)}
-    (folder / "index.arrow").unlink(missing_ok=True)
-    for name, task in (
-        ("first_opening", "open"),
-        *((each, each) for each in ("open", "filter", "access", "epoch")),
-    ):
-        words = [
-            sys.executable,
-            __file__,
-            "--task",
-            task,
-            "--rows",
-            str(options.rows),
-            "--folder",
-            str(options.folder),
-        ]
-        done = subprocess.run(words, capture_output=True, text=True, check=True)
-        results[name] = json.loads(done.stdout)
-        print(name, results[name], flush=True)
-    results["index_bytes_per_row"] = round((folder / "index.arrow").stat().st_size / options.rows)
+    for aged in (True, False):
+        part = beginning(folder, options.aged_rows, aged)
+        (part / index.INDEX).unlink(missing_ok=True)
+        results[f"first_opening_{'without' if aged else 'with'}_footers"] = apart("open", part)
+        shutil.rmtree(part)
+    (folder / index.INDEX).unlink(missing_ok=True)
+    results |= {name: apart(task, folder) for name, task in TASKS.items()}
+    results["index_bytes_per_row"] = round((folder / index.INDEX).stat().st_size / options.rows)
     results["layouts"] = layouts(folder, options)
-    results["index_columns"] = len(INDEX_COLUMNS)
     results["load_of_the_machine"] = round(os.getloadavg()[0], 1)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(options.out, results, indent=2)

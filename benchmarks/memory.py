@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import tyro
 
-from foretrace.interactions import storage
+from foretrace.interactions import shards, storage
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
@@ -79,7 +79,7 @@ def repeat(few: Path, out: Path, number: int) -> None:
         ids = pa.array(np.arange(100 * k, 100 * (k + 1)))
         table = rows.slice(k % 4 * 100, 100).set_column(0, storage.SCHEMA.field("id"), ids)
         name = storage.shard_name(k)
-        manifest["shards"][name] = storage.write_shard(out, name, table)
+        manifest["shards"][name] = shards.write_shard(out, name, table)
     storage.write_manifest(out, manifest)
 
 

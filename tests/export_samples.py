@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import factories
-from foretrace.interactions import storage
+from foretrace.interactions import shards, storage
 from foretrace.interactions.record import Interaction
 from foretrace.predictor import LstmConfig, LstmPredictor, save_checkpoint
 
@@ -18,7 +18,7 @@ def write_data(folder: Path, interactions: list[Interaction]) -> Path:
     (folder / storage.SHARD_FOLDER).mkdir(parents=True)
     manifest = storage.new_manifest({"seed": 0}, len(interactions), len(interactions), {"foretrace": "0.1.0"})
     table = storage.to_table([storage.encode(interaction, interaction.id) for interaction in interactions])
-    manifest["shards"][storage.shard_name(0)] = storage.write_shard(folder, storage.shard_name(0), table)
+    manifest["shards"][storage.shard_name(0)] = shards.write_shard(folder, storage.shard_name(0), table)
     storage.write_manifest(folder, manifest)
     return folder
 

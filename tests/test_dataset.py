@@ -18,7 +18,7 @@ from foretrace.actions import LeverUp
 from foretrace.errors import DatasetError
 from foretrace.files import PARTIAL, sole_writer
 from foretrace.geometry import polygon_area, quaternion_to_matrix
-from foretrace.interactions import storage
+from foretrace.interactions import shards, storage
 from foretrace.interactions.dataset import Dataset, InteractionBatch
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import Interaction, Outcome
@@ -34,7 +34,7 @@ def write_dataset(folder: Path, interactions: list[Interaction], shard_size: int
     for start in range(0, len(rows), shard_size):
         name = storage.shard_name(start // shard_size)
         table = storage.to_table(rows[start : start + shard_size])
-        manifest["shards"][name] = storage.write_shard(folder, name, table)
+        manifest["shards"][name] = shards.write_shard(folder, name, table)
     storage.write_manifest(folder, manifest)
     return folder
 
@@ -304,7 +304,7 @@ def test_no_other_thread_holds_on_to_a_shard_that_was_read(folder, monkeypatch):
 def test_a_shard_of_another_schema_is_refused(folder):
     table, _ = storage.read_shard(folder, storage.shard_name(0))
     name = storage.shard_name(0)
-    entry = storage.write_shard(folder, name, table.drop_columns(["height"]))
+    entry = shards.write_shard(folder, name, table.drop_columns(["height"]))
     with pytest.raises(DatasetError, match=r"another schema \(differs in height\)"):
         storage.read_shard(folder, name, entry["sha256"])
 
@@ -359,7 +359,7 @@ def rewrite(folder: Path, index: int, column: str, change) -> None:
     k = storage.SCHEMA.get_field_index(column)
     values = pa.array(change(table[column].to_pylist()), type=storage.SCHEMA.field(column).type)
     manifest = storage.read_manifest(folder)
-    manifest["shards"][name] = storage.write_shard(folder, name, table.set_column(k, column, values))
+    manifest["shards"][name] = shards.write_shard(folder, name, table.set_column(k, column, values))
     storage.write_manifest(folder, manifest)
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from foretrace import cli
 from foretrace.errors import DatasetError
 from foretrace.files import PARTIAL
-from foretrace.interactions import derive, storage
+from foretrace.interactions import derive, shards, storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
 from foretrace.simulation import collect as collecting
@@ -134,7 +134,7 @@ def test_ids_that_repeat_are_refused(sources, tmp_path):
     table, _ = storage.read_shard(tmp_path / "odd", name)
     table = table.set_column(0, "id", pa.array([0] * table.num_rows, pa.int64()))
     manifest = storage.read_manifest(tmp_path / "odd")
-    manifest["shards"][name] = storage.write_shard(tmp_path / "odd", name, table)
+    manifest["shards"][name] = shards.write_shard(tmp_path / "odd", name, table)
     storage.write_manifest(tmp_path / "odd", manifest)
     for make in (
         lambda out: derive.merge([tmp_path / "odd", sources / "other"], out),

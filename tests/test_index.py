@@ -1,15 +1,17 @@
 """The columns of a large data set that are kept in a file beside it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
 from foretrace.errors import DatasetError
-from foretrace.interactions import dataset as datasets
-from foretrace.interactions import index, parameters, storage
+from foretrace.interactions import index, parameters, shards, storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect
@@ -21,7 +23,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     """A data set of four shards, which does not fit into memory."""
     monkeypatch.setattr(collecting, "SHARD_SIZE", 4)
     collect(CollectConfig(objects=2), tmp_path / "data", 1, Console(quiet=True), fake_trial)
-    monkeypatch.setattr(datasets, "CACHE_BYTES", 0)
+    monkeypatch.setattr(shards, "CACHE_BYTES", 0)
     return tmp_path / "data"
 
 
@@ -38,9 +40,24 @@ def read(monkeypatch) -> list[str]:
     return names
 
 
-def test_a_second_opening_reads_one_shard_and_finds_the_same(folder, read):
+@pytest.fixture
+def old(folder, tmp_path) -> Path:
+    """The same as it was written when shards had no index in their footers."""
+    aged = tmp_path / "old"
+    shutil.copytree(folder, aged)
+    manifest = storage.read_manifest(aged)
+    for name in manifest["shards"]:
+        table, _ = storage.read_shard(folder, name)
+        pq.write_table(table, aged / name, compression="zstd", use_dictionary=False)
+        manifest["shards"][name] = storage.shard_entry((aged / name).read_bytes(), table)
+    storage.write_manifest(aged, manifest)
+    return aged
+
+
+def test_the_first_opening_reads_footers(folder, read):
     first = Dataset.open(folder, failed=True)
-    assert len(set(read)) == 4
+    assert set(read) == {storage.shard_name(0)}, "read to see how large it is"
+    assert first.index.equals(index.index_of(first.table))
     read.clear()
     second = Dataset.open(folder, failed=True)
     assert read == [storage.shard_name(0)]
@@ -50,7 +67,77 @@ def test_a_second_opening_reads_one_shard_and_finds_the_same(folder, read):
     assert second.where(num_corners=4).ids.tolist() == first.where(num_corners=4).ids.tolist()
 
 
-def test_only_new_shards_are_read(folder, read):
+@pytest.mark.parametrize("room", [0, 2**30])
+def test_an_older_data_set_opens_alike(folder, old, read, room, monkeypatch):
+    monkeypatch.setattr(shards, "CACHE_BYTES", room)
+    whole = Dataset.open(folder, failed=True)
+    read.clear()
+    first = Dataset.open(old, failed=True)
+    assert len(set(read)) == 4
+    assert first.index.equals(whole.index)
+    assert first.table.equals(whole.table)
+    for name, values in whole.batch().parameters.items():
+        np.testing.assert_array_equal(first.batch().parameters[name], values)
+    read.clear()
+    assert Dataset.open(old, failed=True).index.equals(whole.index)
+    assert len(set(read)) == (4 if room else 1)
+
+
+def test_checks_of_what_was_sound_when_it_was_written_are_not_repeated(folder, old, monkeypatch):
+    checked = []
+    monkeypatch.setattr(shards, "check_shard", lambda table, name, rows: checked.append(Path(name)))
+    for each in (folder, old):
+        list(Dataset.open(each, failed=True))
+    assert set(checked) == {old / storage.shard_name(k) for k in range(4)}
+
+
+def test_a_changed_shard_that_kept_its_footer_is_refused(folder):
+    """As pyarrow writes it again: with the metadata that it read."""
+    name = storage.shard_name(1)
+    table = pq.ParquetFile(folder / name).read()
+    column = table.column_names.index("friction")
+    table = table.set_column(column, "friction", pa.array(np.full(len(table), 0.9)))
+    pq.write_table(table, folder / name)
+    manifest = storage.read_manifest(folder)
+    manifest["shards"][name] = storage.shard_entry((folder / name).read_bytes(), table)
+    storage.write_manifest(folder, manifest)
+    opened = Dataset.open(folder)
+    with pytest.raises(
+        DatasetError, match=r"shard-00001\.parquet was changed, and has the index of other rows"
+    ):
+        opened[5]
+    rewritten = shards.write_shard(folder, name, table)
+    storage.write_manifest(folder, {**manifest, "shards": {**manifest["shards"], name: rewritten}})
+    assert Dataset.open(folder)[5].physics.friction == 0.9
+
+
+@pytest.mark.parametrize("place", [0.3, 0.6, 0.9])
+def test_a_damaged_footer_is_not_believed(folder, place):
+    """A flipped bit in it: the shard is read, and found corrupt."""
+    path = folder / storage.shard_name(2)
+    content = bytearray(path.read_bytes())
+    start = content.index(shards.FOOTER)
+    content[int(start + place * (len(content) - start))] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"shard-00002\.parquet is corrupt"):
+        Dataset.open(folder)
+
+
+def test_a_shard_with_a_fault_has_no_index(folder):
+    name = storage.shard_name(1)
+    table, _ = storage.read_shard(folder, name)
+    column = table.column_names.index("friction")
+    table = table.set_column(column, "friction", pa.array(np.full(len(table), np.nan)))
+    manifest = storage.read_manifest(folder)
+    manifest["shards"][name] = shards.write_shard(folder, name, table)
+    storage.write_manifest(folder, manifest)
+    assert shards.FOOTER not in pq.read_metadata(folder / name).metadata
+    with pytest.raises(DatasetError, match=r"shard-00001\.parquet, row 0: friction is not a number"):
+        Dataset.open(folder)
+
+
+def test_only_new_shards_are_read(old, read):
+    folder = old
     whole = Dataset.open(folder, failed=True)
     manifest = storage.read_manifest(folder)
     last = manifest["shards"].pop(storage.shard_name(3))
@@ -100,7 +187,8 @@ def test_missing_and_changed_shards_are_noticed(folder):
         Dataset.open(folder)
 
 
-def test_rows_without_a_checksum_are_read_again(folder, read):
+def test_rows_without_a_checksum_are_read_again(old, read):
+    folder = old
     manifest = json.loads((folder / storage.MANIFEST).read_text())
     manifest["shards"][storage.shard_name(1)].pop("sha256")
     (folder / storage.MANIFEST).write_text(json.dumps(manifest))

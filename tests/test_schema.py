@@ -14,7 +14,7 @@ import foretrace as ft
 from factories import fake_data_set
 from foretrace.errors import SHOWN, CheckpointError, DatasetError, ShapeError, check_type, shown, wrong_type
 from foretrace.files import read_json
-from foretrace.interactions import storage
+from foretrace.interactions import shards, storage
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.soundness import find_faults
 from foretrace.predictor.loading import default_checkpoint
@@ -130,7 +130,7 @@ def with_row(data, folder, change):
     rows = storage.read_shard(folder, name)[0].to_pylist()
     rows[1] = change(rows[1])
     manifest = storage.read_manifest(folder)
-    manifest["shards"][name] = storage.write_shard(folder, name, storage.to_table(rows))
+    manifest["shards"][name] = shards.write_shard(folder, name, storage.to_table(rows))
     storage.write_manifest(folder, manifest)
     return folder
 

@@ -21,7 +21,7 @@ from foretrace.errors import CheckpointError, TrainingError
 from foretrace.evaluation.metrics import evaluate_predictor
 from foretrace.features import FEATURES, Autoencoder256, NoFeatures
 from foretrace.files import LOCK
-from foretrace.interactions import dataset
+from foretrace.interactions import dataset, shards
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split
 from foretrace.predictor import (
@@ -496,7 +496,7 @@ def test_evaluation_rows(tmp_path, batch):
 def test_data_sets_larger_than_memory_train_the_same(tmp_path, monkeypatch, config):
     """Prepared piece by piece: the same numbers to the bit; in single precision, nearly the same ones."""
     fake_data_set(tmp_path / "data")
-    monkeypatch.setattr(dataset, "CACHE_BYTES", 0)
+    monkeypatch.setattr(shards, "CACHE_BYTES", 0)
     monkeypatch.setattr(dataset, "ROWS_AT_ONCE", 16)
     data = Dataset.open(tmp_path / "data")
     whole = train(data, tmp_path / "whole", config=config)

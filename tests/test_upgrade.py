@@ -12,7 +12,8 @@ import factories
 from foretrace.actions import ToolPath
 from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import DatasetError
-from foretrace.interactions import recorded, storage
+from foretrace.interactions import recorded, shards, storage
+from foretrace.interactions import upgrade as upgrading
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.doctor import examine
 from foretrace.interactions.record import Interaction
@@ -91,7 +92,7 @@ def test_early_data_sets_lack_columns_and_settings(old):
     gone = [f"misplaced_{way}" for way in ("ahead", "left", "turn")]
     gone += ["fall_index", "rolling_friction", "table_edge", "insertion", "arc_radius", "sweep", "speed"]
     manifest = json.loads((old / storage.MANIFEST).read_text())
-    manifest["shards"][name] = storage.write_shard(old, name, table.drop_columns(gone))
+    manifest["shards"][name] = shards.write_shard(old, name, table.drop_columns(gone))
     configuration = manifest["configuration"]
     del configuration["recipe"], configuration["randomisation"], configuration["simulation"]["watch_time"]
     del configuration["simulation"]["path"], configuration["simulation"]["physics"]["table_edge"]
@@ -127,8 +128,8 @@ def test_a_crash_at_any_moment_loses_nothing(tmp_path, monkeypatch, calls):
         return crashing
 
     with monkeypatch.context() as patch:
-        for function in ("write_shard", "write_manifest"):
-            patch.setattr(storage, function, crash(getattr(storage, function)))
+        for module, function in ((upgrading, "write_shard"), (storage, "write_manifest")):
+            patch.setattr(module, function, crash(getattr(module, function)))
         with pytest.raises(KeyboardInterrupt):
             upgrade(old)
     upgrade(old)
@@ -174,6 +175,6 @@ def as_version_1(folder: Path, shard: str) -> dict:
     """A shard with the columns that version 1 had; the path is the nominal one."""
     table = storage.read_shard(folder, shard)[0]
     new = ["action", "path", "tool", "camera", "timestep", "sample_period", "watch_time"]
-    return storage.write_shard(
+    return shards.write_shard(
         folder, shard, table.drop_columns([*new, "execution_ahead", "execution_left", "execution_turn"])
     )

@@ -141,6 +141,12 @@ class Url:
         """A file in memory, to be read."""
         return BytesIO(self.read_bytes())
 
+    @contextmanager
+    def opened(self) -> "Iterator[Any]":
+        """A file of pyarrow, of which parts are read."""
+        with self._opened() as (store, path), store.open_input_file(path) as file:
+            yield file
+
     def _type(self) -> str:
         with self._opened() as (store, path):
             return store.get_file_info(path).type.name

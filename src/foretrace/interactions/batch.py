@@ -115,6 +115,7 @@ class InteractionBatch:
             DatasetError: Two of them were sampled at different times.
         """
         from foretrace.interactions import storage
+        from foretrace.interactions.parameters import parameter_values
         from foretrace.interactions.tables import batch_of, common_times
 
         check_type("interactions", interactions, Iterable, DatasetError)
@@ -129,7 +130,7 @@ class InteractionBatch:
         ]
         known = dict(zip(descriptions, (interaction.object for interaction in interactions), strict=True))
         table = storage.to_table(rows)
-        return batch_of(table, known, common_times([table]))
+        return batch_of(table, known, common_times([table]), parameter_values(table))
 
     @classmethod
     def from_views(

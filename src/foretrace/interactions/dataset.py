@@ -1,8 +1,7 @@
 """Interactions on disk, read as they are needed."""
 
 import warnings
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
@@ -19,10 +18,9 @@ from foretrace.extras import named_extras
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch as InteractionBatch
 from foretrace.interactions.batch import chosen_rows
-from foretrace.interactions.index import kept_index, places_of
-from foretrace.interactions.parameters import parameters_in
+from foretrace.interactions.index import PARAMETER, SCHEMA, kept_index, places_of
 from foretrace.interactions.record import Interaction
-from foretrace.interactions.soundness import check_shard
+from foretrace.interactions.shards import Shards
 from foretrace.interactions.tables import batch_of, common_times
 from foretrace.objects import ObjectModel, object_from_json
 from foretrace.schema import parse_json
@@ -31,20 +29,10 @@ from foretrace.urls import Url, as_place, read_each
 if TYPE_CHECKING:
     import pandas as pd
 
-CACHE_BYTES = 256 * 2**20
-"""A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
 ROWS_AT_ONCE = 100
 """Interactions that are read together where a data set is gone through: those of a shard."""
 MOST_OBJECTS = 2000
 """Objects that are kept built."""
-ACTION = ("path", "tool")
-"""Columns that are decoded to be checked."""
-INDEX_COLUMNS = [
-    field.name
-    for field in storage.SCHEMA
-    if field.name not in (*storage.TRAJECTORIES, "joint_trajectory", "mask", "height", "object")
-]
-"""Columns that are always in memory: some 600 bytes a row."""
 
 
 class Dataset:
@@ -53,25 +41,31 @@ class Dataset:
     ``dataset[3]`` is the fourth interaction; ``dataset[10:20]`` and ``dataset[indices]`` are data sets again.
 
     Images and trajectories are read from disk when they are needed, and kept in memory if all fit into
-    `CACHE_BYTES`: a data set may be larger than memory, as long as it is read by iteration or by `batches`.
+    `shards.CACHE_BYTES`: a data set may be larger than memory, as long as it is read by iteration or by `batches`.
     """
 
-    def __init__(self, shards: "_Shards", index: pa.Table, places: np.ndarray, manifest: Mapping[str, Any]):
-        self.index = index
-        """Columns of a few numbers a row, as a pyarrow table; `storage.COLUMNS` and `parameters` explain them."""
+    def __init__(
+        self,
+        shards: Shards,
+        index: pa.Table,
+        places: np.ndarray,
+        manifest: Mapping[str, Any],
+        chosen: np.ndarray | None = None,
+    ):
         self.manifest = manifest
         """Configuration, versions, units and shards of the folder."""
         self.path = shards.path
         """The folder that it was read from, or its URL."""
         self._shards, self._places = shards, places
+        self._whole, self._chosen = index, chosen
         self._objects: dict[str, ObjectModel] = {}
 
     @classmethod
     def open(cls, path: str | Path | Url, failed: bool = False) -> "Dataset":
         """Open a data set; checksums of all shards are verified.
 
-        Of one that does not fit into memory, shards are verified when they are first seen, and when they are read: the
-        columns that are always in memory are kept beside it, in ``index.arrow``; of a URL, in the user's cache.
+        Of one that does not fit into memory, shards are verified when they are read, and where they lack the index of
+        their rows. The indices of all are kept beside it, in ``index.arrow``; of a URL, in the user's cache.
 
         Args:
             path: The folder written by ``foretrace simulate``, or its URL, as ``s3://bucket/set``.
@@ -83,7 +77,7 @@ class Dataset:
         path = as_place(path, DatasetError)
         check_type("failed", failed, bool, DatasetError, "True or False")
         manifest = storage.read_manifest(path)
-        shards = _Shards(path, manifest["shards"])
+        shards = Shards(path, manifest["shards"])
         if missing := storage.missing_shards(manifest):
             warnings.warn(
                 f"{path} is not finished: {len(missing)} of {len(missing) + len(shards)} shards are missing; "
@@ -91,14 +85,12 @@ class Dataset:
                 stacklevel=2,
             )
         if shards.fit:
-            whole = read_each(shards.table, range(len(shards)), path)
-            tables = [_encoded(table.select(INDEX_COLUMNS)) for table in whole]
-            empty = _encoded(storage.SCHEMA.empty_table().select(INDEX_COLUMNS))
-            index, rows = pa.concat_tables([empty, *tables]), [table.num_rows for table in tables]
+            read_each(shards.table, range(len(shards)), path)
+            parts = [SCHEMA.empty_table(), *map(shards.index, range(len(shards)))]
+            index = pa.concat_tables(parts, promote_options="default")
+            rows = [part.num_rows for part in parts[1:]]
         else:
-            index, rows = kept_index(
-                path, shards.entries, lambda k: _encoded(shards.table(k, INDEX_COLUMNS)), INDEX_COLUMNS
-            )
+            index, rows = kept_index(path, shards.entries, shards.index)
             shards.indexed = True
         dataset = cls(shards, index, places_of(rows), manifest)
         ids, counts = np.unique(dataset.ids, return_counts=True)
@@ -107,6 +99,11 @@ class Dataset:
                 f"{path} has interaction {ids[counts > 1][0]} more than once: `foretrace data {path}` names the shards"
             )
         return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
+
+    @property
+    def index(self) -> pa.Table:
+        """Columns of a few numbers a row, as a pyarrow table; `storage.COLUMNS` and `parameters` explain them."""
+        return self._whole if self._chosen is None else self._whole.take(pa.array(self._chosen))
 
     def __repr__(self) -> str:
         outcomes = ", ".join(f"{count} {outcome}" for outcome, count in self.outcomes().items())
@@ -186,7 +183,7 @@ class Dataset:
             DatasetError: It is not among these.
         """
         check_type("id", id, (int, np.integer), DatasetError, "a whole number")
-        found = np.flatnonzero(self.index["id"].to_numpy() == id)
+        found = np.flatnonzero(self.ids == id)
         if len(found) == 0:
             raise DatasetError(f"{self.path} has no interaction {id} among the {len(self)} selected")
         return self[found[0]]
@@ -197,7 +194,7 @@ class Dataset:
         Raises:
             DatasetError: Two of them were sampled at different times.
         """
-        return self._batch(self.table)
+        return self._batch(slice(None))
 
     def batches(self, size: int = ROWS_AT_ONCE) -> Iterator[InteractionBatch]:
         """All of them as arrays, a number of rows at a time; sample times are common to all.
@@ -207,8 +204,8 @@ class Dataset:
         """
         if not is_whole(size, 1, 2**63 - 1):
             raise DatasetError(f"size of a batch is {shown(size)}: give a number of rows from 1 on")
-        for table in self._pieces(size=size):
-            yield self._batch(table)
+        for start in range(0, len(self), size):
+            yield self._batch(slice(start, start + size))
             pa.default_memory_pool().release_unused()
 
     @property
@@ -221,7 +218,7 @@ class Dataset:
     @property
     def ids(self) -> Int[np.ndarray, " batch"]:
         """Number of each interaction within its data set."""
-        return self.index["id"].to_numpy()
+        return self._indexed("id").to_numpy()
 
     @cached_property
     def lengths(self) -> Int[np.ndarray, " batch"]:
@@ -248,7 +245,7 @@ class Dataset:
 
     def outcomes(self) -> dict[str, int]:
         """Number of interactions with each outcome that occurs, in the order in which actions name them."""
-        return count_outcomes(self.index["outcome"].to_pylist())
+        return count_outcomes(dict(zip(*self._distinct("outcome"), strict=True)))
 
     def objects(self) -> Iterator[dict[str, Any]]:
         """Descriptions of the objects, row by row, as of ``ObjectModel.to_dict``."""
@@ -257,19 +254,30 @@ class Dataset:
 
     def _outcome_names(self) -> list[str]:
         """Outcomes that its actions can have, and any other that it holds."""
-        known = [
-            name
-            for label in self.index["action"].unique().to_pylist()
-            for name in ACTIONS.find(label).outcomes
-        ]
-        return list(dict.fromkeys([*known, FAILED, *self.index["outcome"].unique().to_pylist()]))
+        known = [name for label in self._distinct("action")[0] for name in ACTIONS.find(label).outcomes]
+        return list(dict.fromkeys([*known, FAILED, *self._distinct("outcome")[0]]))
+
+    def _distinct(self, name: str) -> tuple[list[Any], list[int]]:
+        """Values of a column of the index, in the order in which they first occur, and how often each of them does."""
+        found = self._indexed(name).value_counts()
+        return found.field("values").to_pylist(), found.field("counts").to_pylist()
+
+    def _indexed(self, name: str) -> pa.ChunkedArray:
+        """A column of the index."""
+        column = self._whole[name]
+        return column if self._chosen is None else column.take(pa.array(self._chosen))
 
     def _column(self, name: str) -> np.ndarray:
         """A column of single values, or a parameter of the actions."""
         scalars = [f.name for f in storage.SCHEMA if not pa.types.is_nested(f.type)]
         if name in scalars:
-            table = self.index if name in INDEX_COLUMNS else self._rows(slice(None), [name])
-            return table[name].to_numpy()
+            column = self._indexed(name) if name in SCHEMA.names else self._rows(slice(None), [name])[name]
+            if not pa.types.is_string(column.type):
+                return column.to_numpy()
+            texts = (
+                column.combine_chunks().dictionary_encode()
+            )  # of which few differ: one object for all that are equal
+            return np.array([*texts.dictionary.to_pylist(), ""], dtype=object)[texts.indices.to_numpy()]
         if name not in self.parameters:
             names = [*scalars, *self.parameters]
             close = get_close_matches(name, names, n=3) or names
@@ -279,11 +287,12 @@ class Dataset:
     @cached_property
     def parameters(self) -> dict[str, np.ndarray]:
         """Parameters of the actions by name [SI], one number a row; NaN where an action lacks one."""
-        return parameters_in(self.index)
+        names = [name for name in self._whole.column_names if name.startswith(PARAMETER)]
+        return _occurring({name.removeprefix(PARAMETER): self._indexed(name).to_numpy() for name in names})
 
     def _view(self, rows: np.ndarray) -> "Dataset":
-        index = self.index.take(pa.array(rows, type=pa.int64()))
-        view = Dataset(self._shards, index, self._places[rows], self.manifest)
+        chosen = rows if self._chosen is None else self._chosen[rows]
+        view = Dataset(self._shards, self._whole, self._places[rows], self.manifest, chosen)
         view._objects = self._objects
         if "times" in self.__dict__:  # common to all that come from the same data set
             view.__dict__["times"] = self.times
@@ -305,10 +314,12 @@ class Dataset:
         """All rows with all or some columns, a number of rows at a time."""
         return (self._rows(slice(start, start + size), columns) for start in range(0, len(self), size))
 
-    def _batch(self, table: pa.Table) -> InteractionBatch:
+    def _batch(self, rows: slice) -> InteractionBatch:
+        table = self._rows(rows)
         descriptions = table["object"].unique().to_pylist()
         objects = {description: self._object(description) for description in descriptions}
-        return batch_of(table, objects, self.times)
+        parameters = _occurring({name: values[rows] for name, values in self.parameters.items()})
+        return batch_of(table, objects, self.times, parameters)
 
     def _decode(self, row: dict[str, Any]) -> Interaction:
         return storage.decode(row, self._object(row["object"]))
@@ -326,57 +337,12 @@ class Dataset:
         return self._objects[description]
 
 
-def _encoded(table: pa.Table) -> pa.Table:
-    """A table whose long texts, of which few differ, are stored once each."""
-    for name in ("path", "tool", "versions"):
-        number = table.column_names.index(name)
-        table = table.set_column(number, name, table[name].dictionary_encode())
-    return table.unify_dictionaries()
+def _occurring(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Parameters that some action has."""
+    return {name: values for name, values in parameters.items() if not np.isnan(values).all()}
 
 
-class _Shards:
-    """Tables of a data set's shards, kept in memory if all of them fit; otherwise only the last one that was read."""
-
-    def __init__(self, path: Path | Url, entries: Mapping[str, storage.ShardEntry]):
-        self.path = path
-        self.entries = sorted(entries.items())
-        self._kept: dict[int, pa.Table] = {}
-        self._sound: set[int] = set()
-        self.indexed = False
-        """Whether the columns of the index were checked, of shards that still have their checksum."""
-
-    def __len__(self) -> int:
-        return len(self.entries)
-
-    @cached_property
-    def fit(self) -> bool:
-        """Whether all of them fit into memory, to judge by the first one."""
-        return len(self) == 0 or self.table(0).nbytes * len(self) <= CACHE_BYTES
-
-    def table(self, number: int, columns: list[str] | None = None) -> pa.Table:
-        """The rows of a shard, with all or some of its columns.
-
-        Raises:
-            DatasetError: It is missing or corrupt.
-        """
-        table = self._kept.get(number)
-        if table is None:
-            name, entry = self.entries[number]
-            table = storage.read_shard(self.path, name, entry.get("sha256"), columns=columns)[0]
-            if number not in self._sound:
-                decoded = self.indexed and entry.get("sha256") is not None  # the slowest of what is checked
-                rest = table.drop_columns([n for n in ACTION if decoded and n in table.column_names])
-                check_shard(rest, str(self.path / name), entry.get("rows"))
-            if columns is None:
-                self._sound.add(number)
-                if not self.__dict__.get("fit", False):
-                    self._kept.clear()
-                self._kept[number] = table
-        return table if columns is None else table.select(columns)
-
-
-def count_outcomes(outcomes: Sequence[str]) -> dict[str, int]:
-    """Number of times that each outcome occurs, in the order in which actions name them."""
-    counts = Counter(map(str, outcomes))
+def count_outcomes(counts: Mapping[str, int]) -> dict[str, int]:
+    """How often each outcome occurs, in the order in which actions name them."""
     known = [str(name) for action in ACTIONS.values() for name in action.outcomes]
-    return {name: counts[name] for name in dict.fromkeys([*known, FAILED, *counts]) if counts[name]}
+    return {name: counts[name] for name in dict.fromkeys([*known, FAILED, *counts]) if counts.get(name)}

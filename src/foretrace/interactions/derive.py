@@ -19,6 +19,7 @@ from foretrace.errors import DatasetError, counted, is_number, is_whole, shown
 from foretrace.files import as_path, atomic_folder, make_folder
 from foretrace.interactions import storage
 from foretrace.interactions.recorded import CONFIGURATION
+from foretrace.interactions.shards import write_shard
 from foretrace.interactions.soundness import check_shard
 from foretrace.urls import Url, as_place
 
@@ -120,7 +121,7 @@ class _Writer:
     def _write(self, rows: int) -> None:
         together = pa.concat_tables(self.waiting)
         name = storage.shard_name(len(self.entries))
-        self.entries[name] = storage.write_shard(self.folder, name, together.slice(0, rows))
+        self.entries[name] = write_shard(self.folder, name, together.slice(0, rows))
         self.waiting = [together.slice(rows)]
 
     def finish(self, configuration: Mapping[str, Any], versions: Mapping[str, str]) -> int:

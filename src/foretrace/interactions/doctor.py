@@ -4,6 +4,7 @@ import fnmatch
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,8 @@ def _examine(path: Path | Url, repair: bool) -> Diagnosis:
             raise
         findings.append(Finding(storage.MANIFEST, str(error)))
         manifest = None
-    tables: dict[str, pa.Table] = {}
+    ids: dict[str, list[int]] = {}
+    outcomes: Counter[str] = Counter()
     there = fnmatch.filter(names_in(path / storage.SHARD_FOLDER), "shard-*.parquet")
     on_disk = {f"{storage.SHARD_FOLDER}/{name}" for name in there}
     shards = {} if manifest is None else manifest["shards"]
@@ -88,7 +90,8 @@ def _examine(path: Path | Url, repair: bool) -> Diagnosis:
         except DatasetError as error:
             findings.append(_set_aside(path, name, shards, str(error), repair))
             continue
-        tables[name] = table
+        ids[name] = table["id"].drop_null().to_pylist()
+        outcomes.update(table["outcome"].drop_null().to_pylist())
         faults = list(_unsound_rows(name, table))
         findings += faults
         if manifest is None:
@@ -101,16 +104,14 @@ def _examine(path: Path | Url, repair: bool) -> Diagnosis:
             if repair:
                 shards[name] = storage.shard_entry(content, table)
     if manifest is not None:
-        reported = {finding.file for finding in findings if not finding.repaired} - tables.keys()
-        problems = _unsound_ids(tables, manifest, storage.how_to_restore(path))
+        reported = {finding.file for finding in findings if not finding.repaired} - ids.keys()
+        problems = _unsound_ids(ids, manifest, storage.how_to_restore(path))
         findings += [problem for problem in problems if problem.file not in reported]
-        findings += (
-            _unsound_notes(path, tables) if manifest["configuration"] == recorded.CONFIGURATION else []
-        )
+        if manifest["configuration"] == recorded.CONFIGURATION:
+            findings += _unsound_notes(path, chain.from_iterable(ids.values()))
     if repair and manifest is not None:
         storage.write_manifest(path, manifest)
-    outcomes = [outcome for table in tables.values() for outcome in table["outcome"].drop_null().to_pylist()]
-    return Diagnosis(tuple(findings), len(outcomes), count_outcomes(outcomes))
+    return Diagnosis(tuple(findings), outcomes.total(), count_outcomes(outcomes))
 
 
 def _stray_files(path: Path | Url, repair: bool) -> Iterator[Finding]:
@@ -170,23 +171,22 @@ def _without_gaps(ids: Iterable[int], start: int, stop: int) -> bool:
     return len(found) == stop - start > 0 and found[0] == start and found[-1] == stop - 1
 
 
-def _unsound_notes(path: Path | Url, tables: dict[str, pa.Table]) -> Iterator[Finding]:
+def _unsound_notes(path: Path | Url, ids: Iterable[int]) -> Iterator[Finding]:
     """Notes beside recordings that are missing or damaged."""
-    for table in tables.values():
-        for id in table["id"].drop_null().to_pylist():
-            try:
-                recorded.read_notes(path, id)
-            except DatasetError as error:
-                yield Finding(f"{recorded.NOTES_FOLDER}/{id:05d}.json", str(error))
+    for id in ids:
+        try:
+            recorded.read_notes(path, id)
+        except DatasetError as error:
+            yield Finding(f"{recorded.NOTES_FOLDER}/{id:05d}.json", str(error))
 
 
-def _unsound_ids(tables: dict[str, pa.Table], manifest: dict, remedy: str) -> Iterator[Finding]:
+def _unsound_ids(ids: dict[str, list[int]], manifest: dict, remedy: str) -> Iterator[Finding]:
     """Duplicate ids, ids in the wrong shard, and shards that are still to come."""
     size, num_trials = manifest["shard_size"], manifest["num_trials"]
     starts = {storage.shard_name(k): start for k, start in enumerate(range(0, num_trials, size))}
     seen: set[int] = set()
-    for name, table in tables.items():
-        counts = Counter(table["id"].drop_null().to_pylist())
+    for name, found in ids.items():
+        counts = Counter(found)
         if twice := sorted(id for id, count in counts.items() if id in seen or count > 1):
             yield Finding(name, f"duplicate ids {shown(twice)}")
         seen.update(counts)
@@ -195,5 +195,5 @@ def _unsound_ids(tables: dict[str, pa.Table], manifest: dict, remedy: str) -> It
         elif not _without_gaps(counts, starts[name], min(starts[name] + size, num_trials)):
             yield Finding(name, f"its ids do not run from {starts[name]} on without gaps")
     for name in starts:
-        if name not in tables:
+        if name not in ids:
             yield Finding(name, f"not there; {remedy}")

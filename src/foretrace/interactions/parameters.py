@@ -8,9 +8,6 @@ import pyarrow as pa
 from foretrace.actions import Action, Tool
 from foretrace.schema import parse_json
 
-PARAMETER = "parameter "
-"""Beginning of the names of columns with a parameter of the actions each."""
-
 
 # The same rows are checked and then asked for their parameters, and the texts of many rows are the same.
 @lru_cache(maxsize=1024)
@@ -36,18 +33,3 @@ def parameter_values(table: pa.Table) -> dict[str, np.ndarray]:
         name: np.array([parameters.get(name, np.nan) for parameters in found], dtype=float)[rows]
         for name in names
     }
-
-
-def with_parameters(table: pa.Table) -> pa.Table:
-    """A table with a column for each parameter of its actions."""
-    for name, values in parameter_values(table).items():
-        table = table.append_column(PARAMETER + name, pa.array(values, pa.float64()))
-    return table
-
-
-def parameters_in(index: pa.Table) -> dict[str, np.ndarray]:
-    """Parameters of the actions by name [SI], one number a row; NaN where an action lacks one."""
-    names = [name for name in index.column_names if name.startswith(PARAMETER)]
-    if not names:
-        return parameter_values(index)
-    return {name.removeprefix(PARAMETER): index[name].to_numpy().astype(float, copy=False) for name in names}

@@ -14,6 +14,7 @@ from foretrace.geometry import matrix_to_pose, planar_transform, quaternion_to_m
 from foretrace.interactions import storage
 from foretrace.interactions.pushes import RecordedPushes
 from foretrace.interactions.record import Effect, Interaction, Physics, Provenance
+from foretrace.interactions.shards import write_shard
 from foretrace.interactions.topdown import TopDownView
 
 CONFIGURATION = {"source": "recorded", "table": "pushes"}
@@ -109,7 +110,7 @@ def write_pushes(
                 id += 1
             if len(rows) == SHARD_SIZE or (rows and row == len(pushes) - 1):
                 name = storage.shard_name(len(shards))
-                shards[name] = storage.write_shard(folder, name, storage.to_table(rows))
+                shards[name] = write_shard(folder, name, storage.to_table(rows))
                 progress(len(rows))
                 rows = []
         if id == 0:

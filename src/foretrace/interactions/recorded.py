@@ -19,6 +19,7 @@ from foretrace.files import (
 )
 from foretrace.interactions import storage
 from foretrace.interactions.record import Interaction
+from foretrace.interactions.shards import shard_content, write_shard
 from foretrace.schema import Finite, Transform
 from foretrace.urls import Url
 
@@ -117,8 +118,9 @@ def find_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, An
         path = folder / NOTES_FOLDER / f"{id:05d}.json"
         if path.is_file() and _without_place(read_json(path, dict[str, Any], DatasetError, REPEAT)) == wanted:
             row = storage.to_table([storage.encode(replace(interaction, id=id), object_id)])
-            entry = storage.shard_entry(storage.shard_content(row), row)
-            if entry == manifest["shards"].get(storage.shard_name(id)):
+            name = storage.shard_name(id)
+            there, _ = storage.read_shard(folder, name, manifest["shards"].get(name, {}).get("sha256"))
+            if shard_content(there) == shard_content(row):  # as this version writes both
                 return id
     return None
 
@@ -165,7 +167,7 @@ def add_recorded(folder: Path, interaction: Interaction, notes: Mapping[str, Any
         path = folder / NOTES_FOLDER / f"{id:05d}.json"
         write_json(path, dict(notes))
         name = storage.shard_name(id)
-        manifest["shards"][name] = storage.write_shard(folder, name, table)
+        manifest["shards"][name] = write_shard(folder, name, table)
         manifest["num_trials"] = id + 1
         storage.write_manifest(folder, manifest)
     return id

@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from foretrace.actions import FAILED, Action
 from foretrace.errors import DatasetError
-from foretrace.files import read_versioned, write_bytes, write_json
+from foretrace.files import read_versioned, write_json
 from foretrace.interactions.record import Effect, ExecutionOffset, Interaction, Physics, Provenance
 from foretrace.interactions.topdown import VIEW_SIZE, TopDownView
 from foretrace.objects import ObjectModel, object_from_json
@@ -140,6 +140,10 @@ SCHEMA = pa.schema([pa.field(name, kind) for name, (kind, _, _) in COLUMNS.items
 TRAJECTORIES = {"times": 1, "pose_trajectory": 7, "com_trajectory": 3, "tool_trajectory": 7}
 """Numbers per sample of each trajectory column; the joints' count is a column of its own."""
 
+LARGE_COLUMNS = (*TRAJECTORIES, "joint_trajectory", "support_points", "support_corners", "mask", "height")
+LARGE_COLUMNS += ("object", "path", "tool", "versions")
+"""Columns of many bytes a row: what is not always at hand."""
+
 
 def encode(interaction: Interaction, object_id: int) -> dict[str, Any]:
     """One interaction as one row.
@@ -240,20 +244,6 @@ def shard_name(index: int) -> str:
     return f"{SHARD_FOLDER}/shard-{index:05d}.parquet"
 
 
-def write_shard(folder: Path | Url, name: str, table: pa.Table) -> dict[str, Any]:
-    """Write one shard; returns its entry for the manifest (checksum and number of rows)."""
-    content = shard_content(table)
-    write_bytes(folder / name, content)
-    return shard_entry(content, table)
-
-
-def shard_content(table: pa.Table) -> bytes:
-    """The bytes of a shard."""
-    buffer = pa.BufferOutputStream()
-    pq.write_table(table.combine_chunks(), buffer, compression="zstd", use_dictionary=False)
-    return buffer.getvalue().to_pybytes()
-
-
 def shard_entry(content: bytes, table: pa.Table) -> dict[str, Any]:
     """What the manifest says about a shard."""
     return {"sha256": hashlib.sha256(content).hexdigest(), "rows": table.num_rows}
@@ -293,6 +283,7 @@ def read_shard(
         # In this thread: another may let go of Python's bytes later than the interpreter can bear, when it ends.
         file = pq.ParquetFile(pa.BufferReader(content))
         table = file.read(columns=None if columns is None else list(columns), use_threads=False)
+        table = table.replace_schema_metadata(None)  # an index in it is of this file alone
     except (pa.ArrowException, OSError, ValueError) as error:
         raise damaged(f"is not readable Parquet ({str(error).splitlines()[0]})") from error
     if schema is not None and not file.schema_arrow.equals(schema):

@@ -11,7 +11,6 @@ from foretrace.actions import action_transform
 from foretrace.errors import DatasetError
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch, outcome_array, padded
-from foretrace.interactions.parameters import parameter_values
 from foretrace.objects import ObjectModel, Weighted
 
 
@@ -32,13 +31,19 @@ def common_times(tables: Iterable[pa.Table]) -> Float[np.ndarray, " time"]:
     return longest
 
 
-def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndarray) -> InteractionBatch:
+def batch_of(
+    table: pa.Table,
+    objects: Mapping[str, ObjectModel],
+    times: np.ndarray,
+    parameters: Mapping[str, np.ndarray],
+) -> InteractionBatch:
     """Stored interactions as arrays.
 
     Args:
         table: Their rows.
         objects: The objects by their descriptions.
         times: Their `common_times` [s].
+        parameters: Parameters of their actions, as `parameter_values` finds them.
     """
     length = np.diff(table["times"].combine_chunks().offsets.to_numpy()).astype(np.int64)
     corners = _corners_in_action(table, objects)
@@ -63,7 +68,7 @@ def batch_of(table: pa.Table, objects: Mapping[str, ObjectModel], times: np.ndar
         outcome=outcome_array(table["outcome"].to_pylist()),
         execution=execution,
         bevel=np.array([_bevel(objects[each]) for each in table["object"].to_pylist()]).reshape(-1, 2),
-        parameters=constants | parameter_values(table),
+        parameters=constants | dict(parameters),
     )
 
 

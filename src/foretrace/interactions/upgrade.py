@@ -14,6 +14,7 @@ from foretrace.errors import ActionError, DatasetError, shown
 from foretrace.files import as_path, remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.record import ExecutionOffset, Physics, Provenance
+from foretrace.interactions.shards import write_shard
 
 OLD_EXECUTION = "misplaced_"
 """Beginning of the names that version 1 gave to execution errors."""
@@ -72,7 +73,7 @@ def upgrade(path: str | Path) -> int:
         for name in names:
             table, content = _converted(path, name, manifest)
             entry = content and storage.shard_entry(content, table)
-            shards[name] = entry or storage.write_shard(path, name, table)
+            shards[name] = entry or write_shard(path, name, table)
             rows += table.num_rows
             objects |= dict(zip(table["object"].to_pylist(), table["object_id"].to_pylist(), strict=True))
         configuration = _configuration(manifest["configuration"])

@@ -1,6 +1,7 @@
 """The training of a predictor: one loop for all of them (paper, section 4)."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -372,7 +373,7 @@ def parameter_groups(predictor: EffectPredictor) -> list[dict[str, Any]]:
 def _learned(predictor: EffectPredictor, source: Source, split: Split) -> tuple[str, ...]:
     """Outcomes that occur in the training part, in the order in which actions name them; and in those before."""
     before = predictor.learned_from if predictor.fine_tuned else ()
-    return tuple(count_outcomes([*before, *outcome_of(source)[split.train].tolist()]))
+    return tuple(count_outcomes(Counter([*before, *outcome_of(source)[split.train].tolist()])))
 
 
 def _digest(predictor: EffectPredictor) -> str:

@@ -34,6 +34,7 @@ from foretrace.files import (
 from foretrace.interactions import storage
 from foretrace.interactions.dataset import count_outcomes
 from foretrace.interactions.record import Interaction
+from foretrace.interactions.shards import write_shard
 from foretrace.objects import ObjectModel
 from foretrace.simulation import lever_up, recipes
 from foretrace.simulation.engine import ENGINES
@@ -196,7 +197,7 @@ def collect(
                         due = begun + max(MANIFEST_PERIOD, MANIFEST_SHARE * took)
             finally:
                 storage.write_manifest(out, manifest)
-    return count_outcomes(list(counts.elements()))
+    return count_outcomes(counts)
 
 
 def _prepare_folder(out: Path | Url) -> None:
@@ -261,7 +262,9 @@ def _take_stock(
             todo[name] = ids
             continue
         try:
-            table, content = storage.read_shard(out, name, entry and entry["sha256"])
+            known = (entry or {}).get("sha256")
+            columns = ["id", "outcome"] if known else None  # a checksum vouches for the others
+            table, content = storage.read_shard(out, name, known, columns=columns)
             if table["id"].to_pylist() != list(ids):
                 raise DatasetError(f"shard {out / name} does not hold interactions {ids[0]} to {ids[-1]}")
         except DatasetError as error:
@@ -297,7 +300,7 @@ def _simulate_shards(
             parts[name].append(table)
             if sum(part.num_rows for part in parts[name]) == len(todo[name]):
                 whole = pa.concat_tables(sorted(parts.pop(name), key=_first_id))
-                yield name, storage.write_shard(out, name, whole)
+                yield name, write_shard(out, name, whole)
 
 
 def _simulate_on_cluster(
@@ -380,7 +383,7 @@ def _simulate_shard(
             f"node {platform.node()} does not see {out / storage.MANIFEST}: give a folder that all share, or a URL"
         )
     ((name, table),) = _simulate_chunks(simulate, config, [shard])
-    return name, storage.write_shard(out, name, table), Counter(table["outcome"].to_pylist())
+    return name, write_shard(out, name, table), Counter(table["outcome"].to_pylist())
 
 
 def _say(console: Console, line: str) -> None:
