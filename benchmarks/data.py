@@ -10,13 +10,14 @@ and processor time, which says more where other processes wait for the same core
 import json
 import os
 import random
-import resource
+import re
 import shutil
 import subprocess
 import sys
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from rich.console import Console
 import foretrace as ft
 from foretrace.files import write_json
 from foretrace.interactions import index, shards, storage
-from foretrace.simulation.collect import CollectConfig, collect
+from foretrace.simulation.collect import CollectConfig, collect, num_trials, simulate_trial
 from foretrace.simulation.randomisation import RANDOMISED
 
 ROOT = Path(__file__).parents[1]
@@ -52,6 +53,8 @@ class Options:
 
     rows: int = 200_000
     """Interactions."""
+    campaign_rows: int = 1_000_000
+    """Interactions of the simulation of which the command's own memory is measured."""
     aged_rows: int = 20_000
     """Interactions of which the first opening is timed without indices in the shards, too."""
     layout_rows: int = 5_000
@@ -115,6 +118,29 @@ def beginning(folder: Path, rows: int, aged: bool) -> Path:
     return part
 
 
+@cache
+def one(config: CollectConfig) -> ft.Interaction:
+    """The first lever-up of a configuration."""
+    return simulate_trial(config, 0)
+
+
+def repeated(config: CollectConfig, id: int) -> ft.Interaction:
+    """The first lever-up under another number: what simulating takes is not measured."""
+    return replace(one(config), id=id)
+
+
+def campaign(options: Options) -> dict[str, Any]:
+    """A simulation of many lever-ups, by two processes: what the command itself takes."""
+    from data import repeated as by_name  # so that the processes keep what they simulated
+
+    config = CollectConfig(options.campaign_rows // 13, simulation=CONFIG.simulation)
+    shutil.rmtree(options.measured, ignore_errors=True)
+    laps = Laps()
+    collect(config, options.measured, 2, Console(quiet=True), by_name)
+    laps("campaign")
+    return laps.found | {"rows": num_trials(config), "peak_mb": peak_mb()}
+
+
 class Laps:
     """Seconds since the last call, elapsed and of the processor."""
 
@@ -150,7 +176,12 @@ def measure(task: str, folder: Path) -> dict[str, Any]:
         laps("open")
     else:
         read(task, folder, laps)
-    return laps.found | {"peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
+    return laps.found | {"peak_mb": peak_mb()}
+
+
+def peak_mb() -> int:
+    """Peak memory of this process, mapped files included; what the system notes of a child begins with its parent's."""
+    return int(re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[0]) // 1024
 
 
 def read(task: str, folder: Path, laps: Laps) -> None:
@@ -181,9 +212,9 @@ def read(task: str, folder: Path, laps: Laps) -> None:
         laps("epoch_of_1000", 1000 / (BATCHES * BATCH))
 
 
-def apart(task: str, folder: Path) -> dict[str, Any]:
+def apart(task: str, folder: Path, *more: str) -> dict[str, Any]:
     """One measurement, in a process of its own."""
-    words = [sys.executable, __file__, "--task", task, "--measured", str(folder)]
+    words = [sys.executable, __file__, "--task", task, "--measured", str(folder), *more]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     print(task, done.stdout.strip(), flush=True)
     return json.loads(done.stdout)
@@ -286,7 +317,8 @@ def sizes(folder: Path) -> dict[str, float]:
 def main(options: Options) -> None:
     """Make the data set, and measure."""
     if options.task:
-        print(json.dumps(measure(options.task, options.measured)))
+        found = campaign(options) if options.task == "campaign" else measure(options.task, options.measured)
+        print(json.dumps(found))
         return
     folder = make(options)
     results: dict[str, Any] = {"rows": options.rows, "bytes_per_interaction": sizes(folder)}
@@ -297,6 +329,9 @@ def main(options: Options) -> None:
         shutil.rmtree(part)
     (folder / index.INDEX).unlink(missing_ok=True)
     results |= {name: apart(task, folder) for name, task in TASKS.items()}
+    drafts = options.folder / "campaign"
+    results["campaign"] = apart("campaign", drafts, "--campaign-rows", str(options.campaign_rows))
+    shutil.rmtree(drafts)
     results["index_bytes_per_row"] = round((folder / index.INDEX).stat().st_size / options.rows)
     results["layouts"] = layouts(folder, options)
     results["load_of_the_machine"] = round(os.getloadavg()[0], 1)

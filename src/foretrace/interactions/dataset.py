@@ -100,7 +100,7 @@ class Dataset:
             )
         return dataset if failed else dataset.where(outcome=lambda outcome: outcome != FAILED)
 
-    @property
+    @cached_property
     def index(self) -> pa.Table:
         """Columns of a few numbers a row, as a pyarrow table; `storage.COLUMNS` and `parameters` explain them."""
         return self._whole if self._chosen is None else self._whole.take(pa.array(self._chosen))

@@ -31,9 +31,9 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         ``geometry.support_edge`` names); the last two are left out where no corners were observed.
     """
     outcome = dataset.index["outcome"].to_numpy()
-    rows = [_describe(interaction) for interaction in dataset[outcome == Outcome.LEVERED]]
-    shapes = [(obj["kind"], obj.get("height"), obj.get("bevel")) for obj in dataset.objects()]
-    kinds = np.array([kind for kind, _, _ in shapes])
+    levered = dataset[outcome == Outcome.LEVERED]
+    rows = np.fromiter(map(_describe, levered), np.dtype((float, 6)), len(levered))
+    kinds, sizes = _shapes(dataset)
     actions = dataset.index["action"].to_numpy()
     figures: dict[str, Any] = {
         "outcomes": dataset.outcomes(),
@@ -42,15 +42,15 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
             str(action): dataset[actions == action].outcomes() for action in np.unique(actions)
         },
         "interactions": len(dataset),
-        "varies": _ranges(dataset, shapes),
+        "varies": _ranges(dataset, sizes),
         "fell_off_the_table": dataset.index["fall_index"].drop_null().length(),
     }
     rolled = (interaction.effect.com_trajectory[:, :2] for interaction in dataset[outcome == Outcome.ROLLED])
     if distances := [np.linalg.norm(path[-1] - path[0]) for path in rolled]:
         figures["median_rolled_cm"] = float(CM * np.median(distances))
-    if not rows:
+    if not len(rows):
         return figures
-    angle, rise, slide, error, observed, right = np.array(rows).T
+    angle, rise, slide, error, observed, right = rows.T
     figures |= {
         "median_final_tilt_deg": float(np.median(angle)),
         "median_final_rise_cm": float(np.median(rise)),
@@ -64,12 +64,23 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     return figures
 
 
-def _ranges(dataset: Dataset, shapes: list[tuple[str, float | None, Any]]) -> dict[str, tuple[float, float]]:
+def _shapes(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) kinds of the objects, and (n, 3) heights, and widths and heights of bevels [m]; NaN for what one lacks."""
+    names: dict[str, int] = {}
+    none = (np.nan, np.nan)
+    found = (
+        (names.setdefault(obj["kind"], len(names)), obj.get("height", np.nan), *(obj.get("bevel") or none))
+        for obj in dataset.objects()
+    )
+    numbers = np.fromiter(found, np.dtype((float, 4)), len(dataset))
+    return np.array([*names, ""])[numbers[:, 0].astype(int)], numbers[:, 1:]
+
+
+def _ranges(dataset: Dataset, sizes: np.ndarray) -> dict[str, tuple[float, float]]:
     """Least and greatest value of each quantity that is not the same in all interactions."""
     columns = {name: dataset.index[name].to_numpy() for name in VARIABLE} | dataset.parameters
-    columns["height"] = np.array([height for _, height, _ in shapes if height is not None])
-    bevels = np.array([bevel for _, _, bevel in shapes if bevel is not None]).reshape(-1, 2)
-    columns["bevel_width"], columns["bevel_height"] = bevels.T
+    for name, values in zip(("height", "bevel_width", "bevel_height"), sizes.T, strict=True):
+        columns[name] = values[~np.isnan(values)]
     return {
         name: (float(values.min()), float(values.max()))
         for name, values in columns.items()
