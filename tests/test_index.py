@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from foretrace.errors import DatasetError
-from foretrace.interactions import index, parameters, shards, storage
+from foretrace.interactions import index, parameters, recorded, shards, storage
 from foretrace.interactions.dataset import Dataset
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect
@@ -43,15 +43,18 @@ def read(monkeypatch) -> list[str]:
 @pytest.fixture
 def old(folder, tmp_path) -> Path:
     """The same as it was written when shards had no index in their footers."""
-    aged = tmp_path / "old"
-    shutil.copytree(folder, aged)
-    manifest = storage.read_manifest(aged)
+    return aged(Path(shutil.copytree(folder, tmp_path / "old")))
+
+
+def aged(folder: Path) -> Path:
+    """A data set whose shards lose the index in their footers."""
+    manifest = storage.read_manifest(folder)
     for name in manifest["shards"]:
         table, _ = storage.read_shard(folder, name)
-        pq.write_table(table, aged / name, compression="zstd", use_dictionary=False)
-        manifest["shards"][name] = storage.shard_entry((aged / name).read_bytes(), table)
-    storage.write_manifest(aged, manifest)
-    return aged
+        pq.write_table(table, folder / name, compression="zstd", use_dictionary=False)
+        manifest["shards"][name] = storage.shard_entry((folder / name).read_bytes(), table)
+    storage.write_manifest(folder, manifest)
+    return folder
 
 
 def test_the_first_opening_reads_footers(folder, read):
@@ -81,6 +84,14 @@ def test_an_older_data_set_opens_alike(folder, old, read, room, monkeypatch):
     read.clear()
     assert Dataset.open(old, failed=True).index.equals(whole.index)
     assert len(set(read)) == (4 if room else 1)
+
+
+def test_a_recording_is_found_in_an_older_data_set(folder, tmp_path):
+    first, second = Dataset.open(folder)[0], Dataset.open(folder)[5]
+    recorded.add_recorded(tmp_path / "recorded", first, {"start": 1.0})
+    for recordings in (tmp_path / "recorded", aged(tmp_path / "recorded")):
+        assert recorded.find_recorded(recordings, first, {"start": 1.0}) == 0
+        assert recorded.find_recorded(recordings, second, {"start": 1.0}) is None
 
 
 def test_checks_of_what_was_sound_when_it_was_written_are_not_repeated(folder, old, monkeypatch):

@@ -43,12 +43,14 @@ SETTINGS_TYPE = slice(3, 4), b"\x04"
 """Where an answer says what it is, and what a server of HTTP/2 says first."""
 STORE_BYTES = 80 * 2**20
 """Shared memory of a cluster of this machine alone; Ray takes no less than 75 MB."""
-QUIET = {
+VARIABLES = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DEDUP_LOGS": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_worker_niceness": "0",
 }
-"""Variables of the environment that keep Ray from reporting to its makers, and from talking."""
+"""Variables of the environment that keep Ray from reporting to its makers and from talking, and give the processes that
+it begins here the priority of local ones."""
 LACKING = re.compile(r"No module named '([^']+)'")
 """What Python says on a node where something is not installed."""
 TOKENS = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
@@ -197,7 +199,7 @@ def _connect(address: str) -> tuple[Any, tuple[str, int]]:
         raise ForetraceError(f"cluster {shown(address)}: give {LOCAL}N with N from 1 to {MOST_LOCAL}")
     if not colon or not whole or "/" in host:
         raise ForetraceError(f"cluster {shown(address)}: {ADDRESSES}")
-    os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
+    os.environ.update({name: value for name, value in VARIABLES.items() if name not in os.environ})
     if not own:
         _reach(host.strip("[]"), int(port), address)
         os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "1")  # of 40 s each, where the head ends right now
