@@ -13,6 +13,7 @@ from rich.console import Console
 from foretrace.errors import DatasetError
 from foretrace.interactions import index, parameters, recorded, shards, storage
 from foretrace.interactions.dataset import Dataset
+from foretrace.interactions.doctor import examine
 from foretrace.simulation import collect as collecting
 from foretrace.simulation.collect import CollectConfig, collect
 from test_collect import fake_trial
@@ -117,6 +118,7 @@ def test_a_changed_shard_that_kept_its_footer_is_refused(folder):
         DatasetError, match=r"shard-00001\.parquet was changed, and has the index of other rows"
     ):
         opened[5]
+    assert [finding.file for finding in examine(folder).findings] == [name]
     rewritten = shards.write_shard(folder, name, table)
     storage.write_manifest(folder, {**manifest, "shards": {**manifest["shards"], name: rewritten}})
     assert Dataset.open(folder)[5].physics.friction == 0.9

@@ -16,6 +16,7 @@ from foretrace.files import partial_files, remove_partial, sole_writer
 from foretrace.interactions import recorded, storage
 from foretrace.interactions.dataset import count_outcomes
 from foretrace.interactions.parameters import parameter_values
+from foretrace.interactions.shards import STRANGE, has_own_index
 from foretrace.interactions.soundness import find_faults
 from foretrace.objects import object_from_json
 from foretrace.urls import Url, as_place, names_in
@@ -92,6 +93,8 @@ def _examine(path: Path | Url, repair: bool) -> Diagnosis:
             continue
         ids[name] = table["id"].drop_null().to_pylist()
         outcomes.update(table["outcome"].drop_null().to_pylist())
+        if has_own_index(content) is False:
+            findings.append(Finding(name, f"it {STRANGE}"))
         faults = list(_unsound_rows(name, table))
         findings += faults
         if manifest is None:

@@ -21,6 +21,8 @@ CACHE_BYTES = 256 * 2**20
 """A data set of up to this size is kept in memory once it was read: about 5,000 interactions."""
 FOOTER = b"foretrace-index"
 """Entry of a shard's metadata with the index of its rows. A shard with a fault has none, nor has an old one."""
+STRANGE = f"was changed, and has the index of other rows: write it without the entry {FOOTER.decode()} of its metadata"
+"""What is wrong with a shard that has another one's index."""
 ACTION = ("path", "tool")
 """Columns that are decoded to be checked."""
 
@@ -70,7 +72,7 @@ class Shards:
             DatasetError: It is missing or corrupt.
         """
         name, entry = self.entries[number]
-        with suppress(OSError, pa.ArrowException):
+        with suppress(OSError, pa.ArrowException, DatasetError):
             found = unpack(_metadata(self.path / name).get(FOOTER, b""))
             if found is not None and entry.get("rows") in (None, found.num_rows):
                 return found
@@ -104,13 +106,16 @@ class Shards:
             DatasetError: It has the index of other rows.
         """
         name, entry = self.entries[number]
-        text = _metadata(pa.BufferReader(content)).get(FOOTER)
-        if text is not None and not is_of(text, content):
-            raise DatasetError(
-                f"shard {self.path / name} was changed, and has the index of other rows: write it without the entry "
-                f"{FOOTER.decode()} of its metadata, or {storage.how_to_restore(self.path)}"
-            )
-        return text is not None and entry.get("rows") in (None, table.num_rows)
+        own = has_own_index(content)
+        if own is False:
+            raise DatasetError(f"shard {self.path / name} {STRANGE}, or {storage.how_to_restore(self.path)}")
+        return own is True and entry.get("rows") in (None, table.num_rows)
+
+
+def has_own_index(content: bytes) -> bool | None:
+    """Whether the index in the bytes of a shard is of its rows; None: it has none."""
+    text = _metadata(pa.BufferReader(content)).get(FOOTER)
+    return None if text is None else is_of(text, content)
 
 
 def _metadata(file: Path | Url | pa.NativeFile) -> Mapping[bytes, bytes]:
