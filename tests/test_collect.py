@@ -145,6 +145,46 @@ def test_more_objects_begin_with_the_same_trials():
         assert trial(small, id)[2] == trial(large, id)[2]
 
 
+def test_chosen_trials_are_those_of_the_whole_configuration(tmp_path):
+    numbers = tuple(int(k) for k in np.random.default_rng(0).permutation(208)[:130])
+    some = replace(SMALL, trials=numbers)
+    assert num_trials(some) == 130
+    collect(some, tmp_path / "data", workers=1, console=quiet(), simulate=fake_trial)
+    assert not examine(tmp_path / "data").findings
+    made = Dataset.open(tmp_path / "data")
+    batch = made.batch()
+    assert batch.ids.tolist() == [k for k in range(130) if k % 40 != 39]  # the others diverged
+    for k, id in enumerate(batch.ids):
+        obj, action, seed = trial(SMALL, numbers[id])
+        assert made[k].provenance.seed == seed
+        assert made[k].object.to_dict() == obj.to_dict()
+        np.testing.assert_array_equal(made[k].action.contact, action.contact)
+        assert batch.object_ids[k] == collecting._locate(SMALL, numbers[id])[0]
+
+
+def test_chosen_trials_may_become_more_in_whole_shards(tmp_path):
+    numbers = tuple(range(207, 57, -1))
+    collect(replace(SMALL, trials=numbers[:100]), tmp_path / "grown", 1, quiet(), fake_trial)
+    with pytest.raises(DatasetError, match=r"was begun with trials = \[207, 206"):
+        collect(replace(SMALL, trials=numbers[1:]), tmp_path / "grown", 1, quiet(), fake_trial)
+    with pytest.raises(DatasetError, match="was begun with trials"):
+        collect(SMALL, tmp_path / "grown", 1, quiet(), fake_trial)
+    collect(replace(SMALL, trials=numbers), tmp_path / "grown", 1, quiet(), fake_trial)
+    collect(replace(SMALL, trials=numbers), tmp_path / "at-once", 1, quiet(), fake_trial)
+    assert shards_of(tmp_path / "grown") == shards_of(tmp_path / "at-once")
+    with pytest.raises(DatasetError, match="was begun with trials"):  # the last shard is not full
+        collect(replace(SMALL, trials=(*numbers, 0)), tmp_path / "grown", 1, quiet(), fake_trial)
+
+
+@pytest.mark.parametrize(
+    ("trials", "message"),
+    [((208,), "no trial 208"), ((-1,), "no trial -1"), ((3, 4, 3), "trial 3 is named twice")],
+)
+def test_wrong_trials_are_refused(trials, message):
+    with pytest.raises(SimulationError, match=message):
+        replace(SMALL, trials=trials)
+
+
 def test_a_planned_trial_has_everything():
     planned = planned_trial(SMALL, 17)
     assert (planned.config, planned.seed, planned.id) == (SMALL.simulation, trial(SMALL, 17)[2], 17)

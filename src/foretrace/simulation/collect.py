@@ -9,7 +9,7 @@ import platform
 import time
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
@@ -81,6 +81,9 @@ class CollectConfig:
     """Path of the blade in lever-ups."""
     tool: Screwdriver = field(default_factory=Screwdriver)
     """The screwdriver."""
+    trials: tuple[int, ...] = ()
+    """Trials to simulate, by their numbers among all that the other settings ask for, in this order; by default all.
+    A data set may be extended by more of them later, in whole shards."""
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -95,11 +98,20 @@ class CollectConfig:
         for name, kind in (kinds | {"recipe": str, "tool": Screwdriver}).items():
             check_type(name, getattr(self, name), kind, SimulationError)
         RECIPES.find(self.recipe)
+        check_type("trials", self.trials, Sequence, SimulationError, "a list of numbers")
+        object.__setattr__(self, "trials", tuple(self.trials))
+        most = _first_actions(self.recipe, self.objects, self.contacts_per_edge)[-1] - 1 if self.trials else 0
+        for number in self.trials:
+            if not is_whole(number, 0, most):
+                raise SimulationError(f"there is no trial {shown(number)}: this configuration has 0 to {most}")
+        if len(set(self.trials)) < len(self.trials):
+            twice = next(number for number, count in Counter(self.trials).items() if count > 1)
+            raise SimulationError(f"trial {twice} is named twice: name each once")
 
 
 def num_trials(config: CollectConfig) -> int:
     """Number of lever-ups that the configuration asks for; 2080 for the paper's 160 objects."""
-    return _first_actions(config.recipe, config.objects, config.contacts_per_edge)[-1]
+    return len(config.trials) or _first_actions(config.recipe, config.objects, config.contacts_per_edge)[-1]
 
 
 def trial(config: CollectConfig, id: int) -> tuple[ObjectModel, Action, int]:
@@ -145,6 +157,7 @@ def simulate_trial(config: CollectConfig, id: int) -> Interaction:
 
 def _locate(config: CollectConfig, id: int) -> tuple[int, int]:
     """Which object a trial levers, and at which of its contact points."""
+    id = config.trials[id] if config.trials else id
     firsts = _first_actions(config.recipe, config.objects, config.contacts_per_edge)
     object_index = bisect_right(firsts, id) - 1
     return object_index, id - firsts[object_index]
@@ -212,11 +225,14 @@ def _prepare_folder(out: Path | Url) -> None:
 def _open_manifest(config: CollectConfig, out: Path | Url, console: Console) -> dict[str, Any]:
     """The manifest in the folder, checked against the configuration; a new one in an empty folder."""
     wanted = as_json(asdict(config))
+    if not config.trials:
+        del wanted["trials"]  # as of data sets that are older than this setting
     if not (out / storage.MANIFEST).exists():
         manifest = storage.new_manifest(wanted, num_trials(config), SHARD_SIZE, _current_versions(config))
         storage.write_manifest(out, manifest)
         return manifest
     manifest = storage.read_manifest(out)
+    _extend(manifest, wanted)
     if made := manifest["configuration"].get("made"):
         command = storage.COMMANDS.get(str(made.get("how")), "")
         raise DatasetError(
@@ -233,6 +249,13 @@ def _open_manifest(config: CollectConfig, out: Path | Url, console: Console) -> 
     if changed := [f"{k} {now[k]} (was {then.get(k, 'not noted')})" for k in now if now[k] != then.get(k)]:
         _say(console, f"warning: numbers may change within {out}, versions have: {', '.join(changed)}")
     return manifest
+
+
+def _extend(manifest: dict[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Let a data set of some trials go on with more of them, after whole shards."""
+    named, asked = manifest["configuration"].get("trials", ()), wanted.get("trials", ())
+    if named and len(named) % SHARD_SIZE == 0 and asked[: len(named)] == named:
+        manifest["configuration"]["trials"], manifest["num_trials"] = asked, len(asked)
 
 
 def _current_versions(config: CollectConfig) -> dict[str, str]:
