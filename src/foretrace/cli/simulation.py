@@ -19,7 +19,7 @@ ROLLING_TIME = 1.5
 """Time for which solids are observed after the blade has stopped [s]: most have then rolled more than their length."""
 
 
-@adapt((CollectConfig, ("randomisation", "tool")), (SimulationConfig, ("watch_time",)))
+@adapt((CollectConfig, ("randomisation", "tool", "trials")), (SimulationConfig, ("watch_time",)))
 def simulate(
     out: Path,
     config: Annotated[OmitArgPrefixes[CollectConfig], arg(name="")],
@@ -28,6 +28,7 @@ def simulate(
     vary_action: bool = False,
     off_centre: bool = False,
     exact_share: float = 0.0,
+    active: int | None = None,
     workers: int | None = None,
     cluster: str | None = None,
 ) -> None:
@@ -45,6 +46,8 @@ def simulate(
             and direction. Objects and commanded contacts stay the same.
         vary_action: Draw insertion, arc and speed of the blade anew for every lever-up, or the distance of every push.
         exact_share: Share of the lever-ups whose contact is as commanded, with --randomise.
+        active: Simulate this many of the lever-ups only, chosen as those that teach most: a first hundred at random, then
+            those that differ most from what was simulated in what motions depend on.
         off_centre: Move the centre of mass of half the prisms and boxes away from the middle.
         workers: Number of processes; by default one for each core.
         cluster: Address of a Ray cluster that does the work: HOST:PORT, ray://HOST:PORT, or local:N. All nodes must
@@ -72,6 +75,11 @@ def simulate(
         when_interrupted(f"what is done stays in {place}, the same command goes on from there"),
         on_cluster(cluster),
     ):
-        counts = collect(config, place, workers)
+        if active is None:
+            counts = collect(config, place, workers)
+        else:
+            from foretrace.cli.active import collect_actively  # trains predictors
+
+            counts = collect_actively(config, place, active, workers)
     print_outcomes(counts)
     print(f"data set: {place}")

@@ -137,7 +137,7 @@ class NovelFamilies(Experiment):
             batch, Split(np.sort(train), np.sort(validation), np.sort(known))
         )
         assert isinstance(predictor, OneShotPredictor)
-        learned = KDTree(predictor.network_inputs(batch[np.sort(train)]))
+        learned = KDTree(_described(predictor, batch[np.sort(train)]))
         rows: list[Row] = []
         for part, numbers in (("known", np.sort(known)), ("held out", np.flatnonzero(mine))):
             test = batch[numbers[self._askable[numbers]]]
@@ -145,7 +145,7 @@ class NovelFamilies(Experiment):
             found = {name: value for name, (value, *_) in measure(imagined, test).items()}
             valid = np.arange(test.com.shape[1]) < test.length[:, None]
             error = np.asarray(METRICS["full"](imagined.com, np.where(valid[..., None], test.com, np.nan)))
-            distance = learned.query(predictor.network_inputs(test), k=NEIGHBOURS)[0][:, -1]
+            distance = learned.query(_described(predictor, test), k=NEIGHBOURS)[0][:, -1]
             found["count"] = len(test)
             found |= foretold(imagined.futures.expected_error(), distance, error > UNSURE)
             rows += [{"part": part, "metric": name, "value": value} for name, value in found.items()]
@@ -225,6 +225,12 @@ class NovelFamilies(Experiment):
     @property
     def _families(self) -> np.ndarray:
         return self._data[1]
+
+
+def _described(predictor: OneShotPredictor, batch: InteractionBatch) -> Float[np.ndarray, "batch values"]:
+    """What networks are given about actions, without the context."""
+    inputs = predictor.network_inputs(batch)[:, 0, : len(predictor.value_mean)]
+    return np.asarray(inputs.double().cpu())
 
 
 def _at_rim(mask: np.ndarray) -> bool:

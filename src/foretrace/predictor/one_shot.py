@@ -23,7 +23,7 @@ from foretrace.imagined import (
     quantiles_of,
 )
 from foretrace.imagined.belief import EXECUTION, RANGES
-from foretrace.imagined.context import EXACT, first_action
+from foretrace.imagined.context import EXACT, first_action, recorded_context
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.hull import HEIGHT_CELLS, MAX_CORNERS, UNIT
 from foretrace.predictor.base import EffectPredictor
@@ -376,16 +376,29 @@ class OneShotPredictor(EffectPredictor):
         best = futures.states[np.arange(len(com)), futures.probability.argmax(axis=1)].astype(float)
         return ImaginedBatch(self.sample_times, best[..., :3], decode_poses(best), futures)
 
-    def network_inputs(self, batch: InteractionBatch) -> Float[np.ndarray, "batch values"]:
-        """What networks are given about the action, relative to the candidate pivot edge ahead, of unit scale.
+    def network_inputs(self, batch: InteractionBatch) -> Float[Tensor, "batch views values"]:
+        """What networks are given about actions, and about their mirror images, of unit scale.
 
-        The centre of mass is the observed one. The context is left out.
+        The action relative to the candidate pivot edge ahead, and behind it the recorded context. The centre of mass is
+        that of the first sample.
         """
         with torch.inference_mode():
             features = self.compute_features(self.features.inputs(batch))
+            context = recorded_context(batch, self.context, self.marginal)
+            features = self.add_context(features, context)
             com = torch.as_tensor(batch.com[:, 0], dtype=torch.float32, device=self.device)
-            values = self._find_edges(features, com).values[:, 0, 0]
-            return np.asarray(((values - self.value_mean) / self.value_scale).double().cpu())
+            return self._inputs(features, self._find_edges(features, com))[:, :, 0]
+
+    def expected_weights(self, inputs: Float[Tensor, "batch values"]) -> Float[Tensor, "batch components"]:
+        """Weights in the PCA basis that networks expect of such inputs, over all outcomes [m].
+
+        A weight of 1 m displaces the centre of mass by as much, as the root mean square over time.
+        """
+        with torch.inference_mode():
+            rows = inputs.expand(self.config.ensemble, -1, -1)
+            numbers = self.networks(rows).unflatten(-1, (len(self.outcomes), -1)).mean(dim=0)
+            expected = (numbers[..., -1].softmax(dim=-1)[..., None] * numbers[..., :-2]).sum(dim=1)
+            return expected * self.motions[..., :3].square().sum(dim=2).mean(dim=1).sqrt()
 
     def traced(self) -> TracedDistribution:
         """The network from outlines to all futures."""
@@ -417,11 +430,17 @@ class OneShotPredictor(EffectPredictor):
         )  # in mm, whose square does not vanish beside the other
         return ((1e3 * pixel_error(self._corners(features))).square() + own.square()).sqrt() / 1e3
 
-    def _outputs(self, features: Float[Tensor, "batch inputs"], edges: PivotEdges) -> Outputs:
+    def _inputs(
+        self, features: Float[Tensor, "batch inputs"], edges: PivotEdges
+    ) -> Float[Tensor, "batch views edges values"]:
         values = (edges.values - self.value_mean) / self.value_scale
-        if self.context:
-            context = features[:, None, None, self.features.num_features :]
-            values = torch.cat([values, context.expand(*values.shape[:-1], -1)], dim=-1)
+        if not self.context:
+            return values
+        context = features[:, None, None, self.features.num_features :]
+        return torch.cat([values, context.expand(*values.shape[:-1], -1)], dim=-1)
+
+    def _outputs(self, features: Float[Tensor, "batch inputs"], edges: PivotEdges) -> Outputs:
+        values = self._inputs(features, edges)
         rows = values.flatten(0, 2).expand(self.config.ensemble, -1, -1)
         numbers = self.networks(rows).unflatten(1, values.shape[:3]).unflatten(-1, (len(self.outcomes), -1))
         return Outputs(numbers[..., :-2], numbers[..., -2], numbers[..., -1])

@@ -240,7 +240,7 @@ def _open_manifest(config: CollectConfig, out: Path | Url, console: Console) -> 
         )
     found = {**manifest["configuration"], "shard_size": manifest["shard_size"]}
     if different := first_difference(found, {**wanted, "shard_size": SHARD_SIZE}):
-        name, was, asked = different
+        name, was, asked = (shown(each) if isinstance(each, list) else each for each in different)
         raise DatasetError(
             f"{out} was begun with {name} = {was}, asked for is {name} = {asked}; "
             "use the same configuration to go on, or another folder"

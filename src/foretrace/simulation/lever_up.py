@@ -144,6 +144,17 @@ class Trial:
         motion, duration = executed.tool_motion, executed.duration + self.config.watch_time
         return Play(self.obj, executed.T_action_object, executed.tool, motion, duration, self.config.physics)
 
+    def at_rest(self) -> Interaction:
+        """The interaction before anything moves, as far as it is known without playing it: its effect is one sample."""
+        T, config = self.action.T_action_object, self.config
+        com = transform_points(T, self.obj.mass_properties(config.physics.density).com[None])
+        pose, nowhere = matrix_to_pose(T)[None], np.full((1, 7), np.nan)
+        unseen = np.full((2, 2), np.nan)
+        effect = Effect(np.zeros(1), pose, com, nowhere, np.empty((1, 0)), unseen, (), "")
+        made = {name: getattr(config, name) for name in SETTINGS}
+        known = (self.obj, self.action, self.view(), effect, config.physics)
+        return Interaction(*known, Provenance(seed=self.seed, **made), self.execution_error, self.id)
+
     def record(self, view: TopDownView, motion: Motion, engine: Engine) -> Interaction:
         """The record of the motion, in the frame of the action as commanded."""
         executed = self.executed
