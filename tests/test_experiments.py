@@ -94,6 +94,8 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
                                  "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
     "novel-families": lambda root: {"data": root / "plain", "families": ("few corners",),
                                     "recipe": QUICK["one-shot"].change(outcomes=("levered", "slipped"))},
+    "active": lambda root: {"data": root / "plain", "counts": (6, 9), "random_counts": (6, 12), "seeds": (0,),
+                            "recipe": QUICK["one-shot"].change(outcomes=("levered", "slipped"))},
     "identified-world": lambda root: {"draws": 1, "tests": 2, "lever_ups": (1,), "worlds": ("bullet",),
                                       "residual": ResidualConfig(hidden=8, epochs=1, min_steps=2, ensemble=2)},
     "identification": lambda root: {"objects": 1, "lever_ups": 1},

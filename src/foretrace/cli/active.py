@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from foretrace.cli.console import say
-from foretrace.errors import DatasetError, SimulationError, shown
+from foretrace.errors import DatasetError, SimulationError
 from foretrace.imagined.context import BEVELS, CONSTANTS, EXACT
 from foretrace.interactions import storage
 from foretrace.interactions.batch import InteractionBatch
@@ -50,18 +50,22 @@ def collect_actively(
     total = num_trials(config)
     if not SHARD_SIZE < number < total:
         raise SimulationError(
-            f"--active is {number}: this configuration has {total} lever-ups, of which the first {SHARD_SIZE} are drawn at "
-            f"random; give a number from {SHARD_SIZE + 1} to {total - 1}, or more --objects"
+            f"--active is {number}: this configuration has {total} lever-ups, of which {SHARD_SIZE} are drawn at "
+            f"random first; give a number from {SHARD_SIZE + 1} to {total - 1}, or more --objects"
         )
     rng = np.random.default_rng(np.random.SeedSequence([config.seed, ACTIVE_STREAM]))
     trials = tuple(rng.permutation(total)[:SHARD_SIZE].tolist())
     if (out / storage.MANIFEST).exists():
         trials = tuple(storage.read_manifest(out)["configuration"].get("trials", trials))
     if len(trials) > number:
-        raise DatasetError(f"{out} has {len(trials)} chosen lever-ups, --active is {number}: give at least {len(trials)}")
+        raise DatasetError(
+            f"{out} has {len(trials)} chosen lever-ups, --active is {number}: give at least {len(trials)}"
+        )
     counts = collect(replace(config, trials=trials), out, workers)
     while len(trials) < number:
-        say(f"choosing among {min(CANDIDATES, total - len(trials))} lever-ups by what {len(trials)} have taught")
+        say(
+            f"choosing among {min(CANDIDATES, total - len(trials))} lever-ups by what {len(trials)} have taught"
+        )
         trials = (*trials, *_more(config, out, trials, min(len(trials), number - len(trials))))
         counts = collect(replace(config, trials=trials), out, workers)
     return counts
@@ -75,7 +79,9 @@ def _more(config: CollectConfig, out: Path | Url, trials: tuple[int, ...], count
     outcomes = tuple(name for name in trial(config, 0)[1].outcomes if name in batch.outcome)
     batch = batch[np.isin(batch.outcome, outcomes) & (usable_lengths(batch) >= 2)]
     if len(batch) < 2:
-        raise DatasetError(f"{out} has {len(batch)} lever-ups to learn from after {len(trials)}: check its outcomes")
+        raise DatasetError(
+            f"{out} has {len(batch)} lever-ups to learn from after {len(trials)}: check its outcomes"
+        )
     order = rng.permutation(len(batch))
     held = max(1, int(VALIDATION * len(batch)))
     split = Split(np.sort(order[held:]), np.sort(order[:held]), np.zeros(0, dtype=np.int64))
@@ -84,7 +90,9 @@ def _more(config: CollectConfig, out: Path | Url, trials: tuple[int, ...], count
     predictor, _ = fit_predictor(batch, learner, split, training)
     others = np.setdiff1d(np.arange(num_trials(config)), trials)
     others = np.sort(rng.permutation(others)[: max(CANDIDATES, count)])
-    at_rest = InteractionBatch.from_interactions([planned_trial(config, id).at_rest() for id in others.tolist()])
+    at_rest = InteractionBatch.from_interactions(
+        [planned_trial(config, id).at_rest() for id in others.tolist()]
+    )
     return others[choose_actions(predictor, batch[split.train], at_rest, count)].tolist()
 
 
@@ -92,7 +100,9 @@ def _learner(config: CollectConfig, outcomes: tuple[str, ...]) -> OneShotConfig:
     """A small predictor that is conditioned on all that varies."""
     drawn = config.randomisation
     action = trial(config, 0)[1]
-    names = [name for name in (*CONSTANTS, *action.nominal_parameters()) if getattr(drawn, name, None) is not None]
+    names = [
+        name for name in (*CONSTANTS, *action.nominal_parameters()) if getattr(drawn, name, None) is not None
+    ]
     if drawn.bevel_width_factor or drawn.bevel_height_factor:
         names += BEVELS
     if any(getattr(drawn, name) for name in LARGEST):

@@ -53,12 +53,16 @@ def choose_actions(
     return _farthest(known @ scale, others @ scale, count)
 
 
-def _sensitivity(predictor: OneShotPredictor, inputs: Float[Tensor, "batch values"]) -> Float[Tensor, "values axes"]:
+def _sensitivity(
+    predictor: OneShotPredictor, inputs: Float[Tensor, "batch values"]
+) -> Float[Tensor, "values axes"]:
     """Matrix that turns inputs so that their distances are those of the expected motions."""
-    before = predictor.expected_weights(inputs)
-    changes = []
-    for step in STEP * torch.eye(inputs.shape[1], device=inputs.device):
-        changes.append((predictor.expected_weights(inputs + step) - before) / STEP)
+
+    def expected(inputs: Tensor) -> Tensor:
+        return predictor.expected_weights(inputs).mean(dim=0)
+
+    before, steps = expected(inputs), STEP * torch.eye(inputs.shape[1], device=inputs.device)
+    changes = [(expected(inputs + step) - before) / STEP for step in steps]
     slope = torch.stack(changes, dim=1).double()  # (batch, values, components)
     size, axes = torch.linalg.eigh((slope @ slope.mT).mean(dim=0))
     size = size.clamp(min=0)

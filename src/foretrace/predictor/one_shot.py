@@ -389,15 +389,17 @@ class OneShotPredictor(EffectPredictor):
             com = torch.as_tensor(batch.com[:, 0], dtype=torch.float32, device=self.device)
             return self._inputs(features, self._find_edges(features, com))[:, :, 0]
 
-    def expected_weights(self, inputs: Float[Tensor, "batch values"]) -> Float[Tensor, "batch components"]:
-        """Weights in the PCA basis that networks expect of such inputs, over all outcomes [m].
+    def expected_weights(
+        self, inputs: Float[Tensor, "batch values"]
+    ) -> Float[Tensor, "ensemble batch components"]:
+        """Weights in the PCA basis that each network expects of such inputs, over all outcomes [m].
 
         A weight of 1 m displaces the centre of mass by as much, as the root mean square over time.
         """
         with torch.inference_mode():
             rows = inputs.expand(self.config.ensemble, -1, -1)
-            numbers = self.networks(rows).unflatten(-1, (len(self.outcomes), -1)).mean(dim=0)
-            expected = (numbers[..., -1].softmax(dim=-1)[..., None] * numbers[..., :-2]).sum(dim=1)
+            numbers = self.networks(rows).unflatten(-1, (len(self.outcomes), -1))
+            expected = (numbers[..., -1].softmax(dim=-1)[..., None] * numbers[..., :-2]).sum(dim=2)
             return expected * self.motions[..., :3].square().sum(dim=2).mean(dim=1).sqrt()
 
     def traced(self) -> TracedDistribution:

@@ -103,7 +103,9 @@ class CollectConfig:
         most = _first_actions(self.recipe, self.objects, self.contacts_per_edge)[-1] - 1 if self.trials else 0
         for number in self.trials:
             if not is_whole(number, 0, most):
-                raise SimulationError(f"there is no trial {shown(number)}: this configuration has 0 to {most}")
+                raise SimulationError(
+                    f"there is no trial {shown(number)}: this configuration has 0 to {most}"
+                )
         if len(set(self.trials)) < len(self.trials):
             twice = next(number for number, count in Counter(self.trials).items() if count > 1)
             raise SimulationError(f"trial {twice} is named twice: name each once")
