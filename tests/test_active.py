@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from foretrace.cli import main
+from foretrace.cli.active import _learner
 from foretrace.errors import PredictionError
 from foretrace.interactions.batch import InteractionBatch
 from foretrace.interactions.dataset import Dataset
@@ -10,7 +11,7 @@ from foretrace.interactions.splits import Split
 from foretrace.predictor import OneShotConfig, TrainConfig, fit_predictor
 from foretrace.predictor.active import _farthest, choose_actions
 from foretrace.predictor.one_shot import OneShotPredictor
-from foretrace.simulation.collect import CollectConfig, planned_trial, simulate_trial
+from foretrace.simulation.collect import CollectConfig, planned_trial, simulate_trial, trial
 from foretrace.simulation.lever_up import SimulationConfig
 from foretrace.simulation.randomisation import RANDOMISED
 
@@ -79,24 +80,24 @@ def test_a_trial_at_rest_is_the_first_sample_of_what_is_simulated():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"predictor": None}, "predictor of type NoneType"),
-        ({"learned": "data"}, "learned of type str"),
-        ({"candidates": slice(0, 0)}, "candidates holds no actions"),
+        ({"learned": 0}, "learned holds no actions"),
+        ({"candidates": 0}, "candidates holds no actions"),
         ({"count": 21}, "count is 21: give a whole number from 1 to 20"),
         ({"count": 0}, "count is 0"),
     ],
 )
 def test_mistakes_are_named(predictor, batch, change, message):
-    given = {"predictor": predictor, "learned": batch[:10], "candidates": batch[10:], "count": 2} | change
-    if isinstance(given["candidates"], slice):
-        given["candidates"] = batch[given["candidates"]]
+    given = {"learned": 10, "candidates": 20, "count": 2} | change
     with pytest.raises(PredictionError, match=message):
-        choose_actions(**given)
+        choose_actions(
+            predictor, batch[: given["learned"]], batch[10 : 10 + given["candidates"]], given["count"]
+        )
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foretrace.cli.active.EPOCHS", 1)
+    monkeypatch.setattr("foretrace.cli.active.TRAINING", TrainConfig(epochs=1, min_steps=1))
+    monkeypatch.setattr("foretrace.cli.active.CANDIDATES", 30)
 
 
 def test_a_command_simulates_what_it_chooses_and_goes_on(quick, tmp_path, capsys):
@@ -132,17 +133,26 @@ def test_a_command_simulates_what_it_chooses_and_goes_on(quick, tmp_path, capsys
     assert "was begun with trials" in capsys.readouterr().err
 
 
-def test_a_command_chooses_among_varied_lever_ups(quick, tmp_path):
-    words = [
-        "simulate",
-        "--out",
-        str(tmp_path / "data"),
-        "--recipe",
-        "all",
-        "--objects",
-        "24",
-        "--embodiment",
-        "tool",
-    ]
-    assert main([*words, "--randomise", "--vary-action", "--active", "104", "--workers", "1"]) == 0
-    assert len(Dataset.open(tmp_path / "data")) == 104
+@pytest.mark.parametrize(
+    ("words", "context"),
+    [
+        ("", ()),
+        ("--vary-action", ("insertion", "arc_radius", "sweep", "speed")),
+        (
+            "--randomise",
+            ("friction", "tool_friction", "density", "bevel_width", "bevel_height", "contact_error"),
+        ),
+        ("--recipe pushes --vary-action", ("distance",)),
+    ],
+)
+def test_what_varies_is_told_to_the_predictor_that_chooses(words, context, monkeypatch, tmp_path):
+    found = []
+
+    def told(config, *_):
+        found.append(_learner(config, trial(config, 0)[1].outcomes).context)
+        return {"levered": 1}
+
+    monkeypatch.setattr("foretrace.cli.active.collect_actively", told)
+    common = ["--embodiment", "tool", "--objects", "20", "--active", "120"]
+    assert main(["simulate", "--out", str(tmp_path / "data"), *common, *words.split()]) == 0
+    assert found == [context]

@@ -14,14 +14,15 @@ from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split
 from foretrace.predictor import OneShotConfig, TrainConfig, fit_predictor
 from foretrace.predictor.active import choose_actions
+from foretrace.predictor.one_shot import OneShotPredictor
 from foretrace.predictor.one_shot_config import SPEED
 from foretrace.predictor.parts import usable_lengths
 from foretrace.simulation.collect import SHARD_SIZE, CollectConfig, collect, num_trials, planned_trial, trial
 from foretrace.simulation.randomisation import LARGEST, NOTHING
 from foretrace.urls import Url
 
-EPOCHS = 40
-"""Passes of the trainings in between."""
+TRAINING = TrainConfig(epochs=40, learning_rate=OneShotConfig.training.learning_rate)
+"""Settings of the trainings in between."""
 VALIDATION = 0.1
 """Share of what was simulated that the trainings do not learn from."""
 CANDIDATES = 4000
@@ -85,9 +86,10 @@ def _more(config: CollectConfig, out: Path | Url, trials: tuple[int, ...], count
     order = rng.permutation(len(batch))
     held = max(1, int(VALIDATION * len(batch)))
     split = Split(np.sort(order[held:]), np.sort(order[:held]), np.zeros(0, dtype=np.int64))
-    learner = _learner(config, outcomes)
-    training = TrainConfig(epochs=EPOCHS, learning_rate=learner.training.learning_rate, seed=config.seed)
-    predictor, _ = fit_predictor(batch, learner, split, training)
+    predictor, _ = fit_predictor(
+        batch, _learner(config, outcomes), split, replace(TRAINING, seed=config.seed)
+    )
+    assert isinstance(predictor, OneShotPredictor)
     others = np.setdiff1d(np.arange(num_trials(config)), trials)
     others = np.sort(rng.permutation(others)[: max(CANDIDATES, count)])
     at_rest = InteractionBatch.from_interactions(
