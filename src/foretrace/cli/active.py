@@ -14,7 +14,7 @@ from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.splits import Split
 from foretrace.predictor import OneShotConfig, TrainConfig, fit_predictor
 from foretrace.predictor.active import choose_actions
-from foretrace.predictor.one_shot import OneShotPredictor
+from foretrace.predictor.one_shot import FRAMES, OneShotPredictor
 from foretrace.predictor.one_shot_config import SPEED
 from foretrace.predictor.parts import usable_lengths
 from foretrace.simulation.collect import SHARD_SIZE, CollectConfig, collect, num_trials, planned_trial, trial
@@ -65,7 +65,7 @@ def collect_actively(
     counts = collect(replace(config, trials=trials), out, workers)
     while len(trials) < number:
         say(
-            f"choosing among {min(CANDIDATES, total - len(trials))} lever-ups by what {len(trials)} have taught"
+            f"choosing among {min(CANDIDATES, total - len(trials))} actions by what {len(trials)} have taught"
         )
         trials = (*trials, *_more(config, out, trials, min(len(trials), number - len(trials))))
         counts = collect(replace(config, trials=trials), out, workers)
@@ -110,7 +110,7 @@ def _learner(config: CollectConfig, outcomes: tuple[str, ...]) -> OneShotConfig:
     if any(getattr(drawn, name) for name in LARGEST):
         names.append(EXACT)
     return OneShotConfig(
-        feature_options={"heights": True},
+        feature_options={"heights": action.label in FRAMES},  # along edges
         components=48,
         context=tuple(names),
         hidden_share=0.0 if drawn == NOTHING else 0.6,
