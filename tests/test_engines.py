@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
 
@@ -132,6 +133,20 @@ def test_equal_arguments_give_equal_effects_in_this_process_and_another(engine: 
 
 
 @WITHOUT_BULLET
+def test_threads_play_on_one_object_at_once() -> None:
+    obj, _ = trial(3)
+    actions = [LeverUp.at_edge(obj, edge) for edge in range(len(obj.corners))]
+    config = SimulationConfig(embodiment="tool")
+
+    def play(action: LeverUp) -> np.ndarray:
+        return simulate_lever_up(obj, action, config).effect.pose_trajectory
+
+    with ThreadPoolExecutor(len(actions)) as threads:
+        together = list(threads.map(play, actions))
+    for poses, action in zip(together, actions, strict=True):
+        np.testing.assert_array_equal(poses, play(action))
+
+
 def test_engines_agree() -> None:
     """Outcomes and support corners, and paths to about the blade's thickness.
 

@@ -71,7 +71,7 @@ class MujocoEngine(Engine):
             )
         check_divides(timestep, sample_period, arm.CONTROL_PERIOD)
         self.embodiment, self.timestep, self.sample_period = embodiment, timestep, sample_period
-        self._kept: tuple[Any, ObjectModel, mujoco.MjModel, mujoco.MjData] | None = None
+        self._kept: tuple[Any, ObjectModel, mujoco.MjModel] | None = None
 
     def play(
         self,
@@ -85,8 +85,8 @@ class MujocoEngine(Engine):
         """Plays an action in one call of ``mujoco.rollout``."""
         stride = round(self.sample_period / self.timestep)
         control = self._control(tool, tool_motion, duration)
-        model, data = self._compiled(obj, physics, tool, control.coordinates)
-        mujoco.mj_resetData(model, data)
+        model = self._compiled(obj, physics, tool, control.coordinates)
+        data = mujoco.MjData(model)  # of its own: other threads may play with the same model
         data.qpos[:7] = matrix_to_pose(T_action_object @ planar_transform(body_origin(obj), 0.0))
         data.qpos[7:] = control.start
         state = np.empty(mujoco.mj_stateSize(model, STATE))
@@ -105,13 +105,13 @@ class MujocoEngine(Engine):
 
     def _compiled(
         self, obj: ObjectModel, physics: Physics, tool: Tool, coordinates: tuple[int, ...]
-    ) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    ) -> mujoco.MjModel:
         """The compiled scene; kept, as an object is usually acted on at many points in a row."""
-        key = (physics, tool, coordinates)
-        if self._kept is None or self._kept[0] != key or self._kept[1] is not obj:
+        key, kept = (physics, tool, coordinates), self._kept
+        if kept is None or kept[0] != key or kept[1] is not obj:
             model = build_scene(obj, physics, tool, self.embodiment, self.timestep, coordinates).compile()
-            self._kept = (key, obj, model, mujoco.MjData(model))
-        return self._kept[2:]
+            self._kept = kept = (key, obj, model)
+        return kept[2]
 
     def _observe(
         self,

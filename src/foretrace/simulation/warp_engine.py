@@ -114,8 +114,10 @@ class WarpEngine(MujocoEngine):
             seen = self._step([plays[row] for row in rows], [controls[row] for row in rows])
             for row, samples in zip(rows, seen, strict=True):
                 play, control = plays[row], controls[row]
-                model, data = self._compiled(play.obj, play.physics, play.tool, control.coordinates)
-                motions[row] = self._observe(model, data, samples[: len(control.tips)], control)
+                model = self._compiled(play.obj, play.physics, play.tool, control.coordinates)
+                motions[row] = self._observe(
+                    model, mujoco.MjData(model), samples[: len(control.tips)], control
+                )
         return [motions[row] for row in range(len(plays))]
 
     def _step(
@@ -199,7 +201,7 @@ class WarpEngine(MujocoEngine):
         values: dict[str, list[np.ndarray]] = {name: [] for name in (*BATCHED, *GEOM_FIELDS)}
         numbers = {key: number for number, key in enumerate(objects)}
         for play in plays:
-            model, _ = self._compiled(play.obj, play.physics, play.tool, coordinates)
+            model = self._compiled(play.obj, play.physics, play.tool, coordinates)
             count = len(_hulls(play.obj))
             missing = shapes - model.ngeom
             for name in BATCHED:
