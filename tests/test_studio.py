@@ -4,6 +4,7 @@ import io
 import sys
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from foretrace.studio.session import LEVEL, Session
 from foretrace.studio.shapes import EXAMPLES, example, from_file, from_text, prism_of
 from foretrace.studio.texts import learned_html, verdict_html
 from foretrace.studio.watching import WISHES
+from foretrace.studio.work_queue import WorkQueue
 
 TRIANGLE = "0 0\n0.12 0\n0.05 0.1\n"
 
@@ -489,12 +491,32 @@ def test_a_visitor_watches_and_saves(served):
 
 def test_a_choice_that_is_made_while_something_is_drawn_is_kept(served):
     with visit(served) as visitor:
-        page = list(served.pages.values())[-1]
-        with page._lock:
-            visitor.set("goal", "move")
-            visitor.look(seconds=0.5)
-            page.controls.show_choices(page.session.choices)  # as a picture of the former choices does
+        page, drawn = list(served.pages.values())[-1], Event()
+        page.act(drawn.wait)
+        visitor.set("goal", "move")
+        visitor.look(seconds=0.5)
+        page.controls.show_choices(page.session.choices)  # as a picture of the former choices does
+        drawn.set()
         visitor.look(lambda: "goal:move" in visitor.value("link"))
+
+
+def test_work_is_done_in_its_order_and_goes_on_after_a_fault(capfd):
+    queue, begin, done = WorkQueue(), Event(), []
+
+    def work(number: int) -> None:
+        begin.wait()
+        done.append((number, queue.is_latest(number)))
+        if number == 2:
+            raise RuntimeError("a fault of the second")
+
+    for _ in range(4):
+        queue.add(work)
+    begin.set()
+    queue.end()
+    queue.thread.join(5)
+    assert not queue.thread.is_alive()
+    assert done == [(1, False), (2, False), (3, False), (4, True)]
+    assert "RuntimeError: a fault of the second" in capfd.readouterr().err
 
 
 def test_a_link_that_cannot_be_read_is_told(served):
@@ -506,8 +528,9 @@ def test_a_page_ends_with_its_visitor(served):
     with visit(served) as visitor:
         page = list(served.pages.values())[-1]
         visitor.look(seconds=0.1)
-    page._player.join(5)
-    assert not page._player.is_alive()
+    for thread in (page._player, page._work.thread):
+        thread.join(5)
+        assert not thread.is_alive()
     assert page not in served.pages.values()
 
 

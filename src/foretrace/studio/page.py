@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from itertools import count
-from threading import Event, Lock, RLock, Thread
+from threading import Event, Thread
 from time import perf_counter
 from typing import Any
 
@@ -25,6 +24,7 @@ from foretrace.studio.shapes import checked, example, from_file, from_text
 from foretrace.studio.stage import LOOK_AT, Stage
 from foretrace.studio.texts import learned_html, plan_text, simulated_text
 from foretrace.studio.uploads import bound_uploads
+from foretrace.studio.work_queue import WorkQueue
 
 FRAME = 1 / 25
 """Time between two pictures while time runs [s]."""
@@ -51,8 +51,7 @@ class Page:
         self.latencies: list[float] = []
         """Seconds from each of the last events to its picture."""
         self._client, self._data, self._address = client, data, address
-        self._lock, self._order, self._numbers, self._latest = RLock(), Lock(), count(1), 0
-        self._closed = Event()
+        self._work, self._closed = WorkQueue(), Event()
         self._dragged: tuple[np.ndarray, bool] | None = None
         self._chosen: dict[str, Any] = {}
         self._told = -1
@@ -75,37 +74,38 @@ class Page:
     def close(self) -> None:
         """The visitor has gone."""
         self._closed.set()
+        self._work.end()
 
     # --- what the visitor does ---------------------------------------------------------------------------
 
     def act(self, work: Callable[[], None], message: str = "") -> None:
-        """Do something, and draw what follows; of several such wishes at once, the last one is drawn.
+        """Do something after all that was wished before, and draw what follows unless something else waits already.
 
         Args:
             work: What is to be done.
             message: What the visitor is told about it; an error takes its place.
         """
         started = perf_counter()
-        with self._order:
-            self._latest = number = next(self._numbers)
-        with self._lock:
-            if self._closed.is_set():
-                return
-            self._message = message
-            try:
-                work()
-            except ForetraceError as error:
-                self._message = str(error)
-            if number == self._latest and not self._closed.is_set():
-                self._draw()
-                self.latencies = [*self.latencies[-999:], perf_counter() - started]
-                self._draw_what_takes_time(number)
+        self._work.add(lambda number: self._act(number, work, message, started))
+
+    def _act(self, number: int, work: Callable[[], None], message: str, started: float) -> None:
+        if self._closed.is_set():
+            return
+        self._message = message
+        try:
+            work()
+        except ForetraceError as error:
+            self._message = str(error)
+        if self._work.is_latest(number) and not self._closed.is_set():
+            self._draw()
+            self.latencies = [*self.latencies[-999:], perf_counter() - started]
+            self._draw_what_takes_time(number)
 
     def _choose(self, name: str) -> None:
         """Note at once what the visitor has chosen: what is drawn meanwhile shows the former choice again."""
         slider = self.controls.sliders.get(name)
         self._chosen[name] = slider.value if slider else getattr(self.controls, name).value
-        self._later(lambda: self._take_choice(name))
+        self.act(lambda: self._take_choice(name))
 
     def _take_choice(self, name: str) -> None:
         value = self._chosen.pop(name, OWN)  # a later choice of the same may have been taken already
@@ -145,7 +145,7 @@ class Page:
             button.on_upload(lambda event, kind=kind: self.act(lambda: photo.take(kind)))
         _on(photo.example, lambda: self.act(self._take_example_photo))
         _on(photo.find, lambda: self.act(lambda: self._take_photo(photo.request(self._height()))))
-        bound_uploads(self._client.gui, lambda text: self._later(lambda: None, text))
+        bound_uploads(self._client.gui, lambda text: self.act(lambda: None, text))
         for handle in (self.stage.grip, *self.stage.parts):
             for modifier in (None, "shift"):
                 handle.on_drag("left", modifier=modifier)(self._drag)
@@ -157,11 +157,7 @@ class Page:
         if abs(way[2]) < 1e-6 or (reach := -eye[2] / way[2]) <= 0:
             return
         self._dragged = (eye + reach * way)[:2], event.modifier == "shift"
-        self._later(self._follow)
-
-    def _later(self, work: Callable[[], None], message: str = "") -> None:
-        """Do something in another thread than the one that takes in messages."""
-        self._client._viser_server._thread_executor.submit(lambda: self.act(work, message))
+        self.act(self._follow)
 
     def _follow(self) -> None:
         """Bring the contact, or the direction, to where the pointer is."""
@@ -328,7 +324,7 @@ class Page:
             (self.controls.twin.value, self._draw_twin),
             (self._photo is not None, self._draw_photo),
         ):
-            if wanted and number == self._latest:
+            if wanted and self._work.is_latest(number):
                 try:
                     show()
                 except ForetraceError as error:
