@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from foretrace.geometry import convex_hull, invert_transform, pose_to_matrix, transform_points
+from foretrace.geometry import invert_transform, pose_to_matrix, transform_points
 from foretrace.interactions.record import Interaction
 from foretrace.objects import MeshObject
 from foretrace.objects.surface import faces_of
@@ -207,7 +207,7 @@ class _Stage:
         """The object's shadow, object and blade, other motions, the region, and the paths up to sample ``k``."""
         scene = self.scene
         pose = pose_to_matrix(scene.pose[k])
-        shadow = convex_hull(transform_points(pose, self._body.points)[:, :2])
+        shadow = _hull(transform_points(pose, self._body.points)[:, :2])
         _fill(picture, self._pixels(np.column_stack([shadow, np.zeros(len(shadow))])), "#cfd3da")
         faces = [(*face, self._body.edge) for face in self._body.seen(pose)]
         if scene.tool is not None:
@@ -255,9 +255,9 @@ class _Stage:
             around[..., 2], min(0.0, band.path[:, 2].min())
         )  # nothing is below the table
         shape = np.zeros(self._size, dtype=np.uint8)
-        hulls = [convex_hull(self._pixels(points)) for points in around]
+        hulls = [_hull(self._pixels(points)) for points in around]
         for pair in pairwise(hulls):
-            swept = _fixed(convex_hull(np.concatenate(pair)))
+            swept = _fixed(_hull(np.concatenate(pair)))
             cv2.fillConvexPoly(shape, swept, (255.0,), cv2.LINE_AA, SUBPIXELS)
         columns, rows = np.flatnonzero(shape.any(axis=0)), np.flatnonzero(shape.any(axis=1))
         if not len(columns):
@@ -296,6 +296,11 @@ def _paler(color: str) -> tuple[float, ...]:
 def _fixed(points: np.ndarray) -> np.ndarray:
     """Pixels as OpenCV takes them, in fractions; a pixel's middle is a whole number there."""
     return np.round((points - 0.5) * 2**SUBPIXELS).astype(np.int32)
+
+
+def _hull(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
+    """Convex hull, as precise as pixels are."""
+    return cv2.convexHull(points.astype(np.float32))[:, 0].astype(float)
 
 
 def _fill(picture: np.ndarray, corners: np.ndarray, color: Any) -> None:
