@@ -17,6 +17,7 @@ pytest.importorskip("httpx2")
 from fastapi.testclient import TestClient
 
 from foretrace.studio import watches
+from foretrace.studio.bodies import PredictBody
 from foretrace.studio.service import MOST_BYTES, make_service
 from foretrace.studio.session import Session
 
@@ -42,6 +43,15 @@ def test_a_prediction_is_the_librarys(client):
     )
     assert told == {"times": direct.times.tolist()} | json.loads(json.dumps(direct.to_dict(0.5, 3)))
     assert len(told["futures"]) == 3
+
+
+def test_an_object_that_is_sent_again_is_not_made_again():
+    first, again, other = (
+        PredictBody.model_validate(KNOWN | {"object": OBJECT | {"height": height}}).make_object()
+        for height in (0.02, 0.02, 0.03)
+    )
+    assert first is again
+    assert other.height == 0.03
 
 
 def test_a_plan_can_be_opened_again(client, tmp_path):

@@ -1,10 +1,11 @@
 """What requests to the service may hold, all bounded, and how the library's own things are made of it."""
 
 from dataclasses import MISSING, fields
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.errors import PlanningError
@@ -23,6 +24,8 @@ Matrix = Annotated[
 ]
 ConstantName = Literal["friction", "tool_friction", "density", "contact_error", "bevel_width", "bevel_height"]
 GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "slide-off"]
+MOST_KEPT = 32
+"""Objects that are kept for further requests about them, at most."""
 MOST_SAMPLES = 1000
 """Samples in one request, at most."""
 assert set(CONSTANTS) == set(ConstantName.__args__)
@@ -84,6 +87,12 @@ class CylinderBody(_Body):
 ObjectBody = Annotated[PrismBody | BoxBody | CylinderBody, Field(discriminator="kind")]
 
 
+@lru_cache(maxsize=MOST_KEPT)
+def _object(text: str) -> ObjectModel:
+    body: PrismBody | BoxBody | CylinderBody = TypeAdapter(ObjectBody).validate_json(text)
+    return body.make()
+
+
 class ActionBody(_Body):
     """A lever-up on the object."""
 
@@ -119,6 +128,10 @@ class Known(_Body):
     object: ObjectBody
     context: ContextBody = None
     """Constants that are known, by name [SI]; null: the nominal ones; ``unknown``: none."""
+
+    def make_object(self) -> ObjectModel:
+        """The object; for a description that was sent lately the same again, with all that is known of its shape."""
+        return _object(self.object.model_dump_json())
 
 
 class PredictBody(Known):

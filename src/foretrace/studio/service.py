@@ -175,7 +175,7 @@ def _add_predictions(app: FastAPI) -> None:
     )
     def predict(body: PredictBody) -> Response:
         """Futures with their probabilities, in the action frame: origin at the contact, x along the action, z up."""
-        obj = body.object.make()
+        obj = body.make_object()
         imagined = imagine(obj, body.action, body.context)
         return _json({"times": imagined.times.tolist(), **imagined.to_dict(body.level, body.most_futures)})
 
@@ -184,7 +184,7 @@ def _add_predictions(app: FastAPI) -> None:
     )
     def make_plan(body: PlanBody) -> Response:
         """The best lever-up, as `foretrace plan` writes it to plan.json."""
-        obj, goal = body.object.make(), body.goal.make()
+        obj, goal = body.make_object(), body.goal.make()
         context: Any = body.context
         placed = None if body.T_table_object is None else np.array(body.T_table_object)
         if not turns.acquire(timeout=PATIENCE):
@@ -211,7 +211,7 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
     )
     def begin(body: MonitorBody) -> Begun:
         """A monitor of one execution; give it every tracked sample."""
-        obj = body.object.make()
+        obj = body.make_object()
         belief = Belief(worlds=max(body.worlds, 2)) if body.worlds else None
         imagined = imagine(obj, body.action, body.context if belief is None else belief)
         monitor = Monitor(
