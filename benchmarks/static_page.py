@@ -1,7 +1,8 @@
 """The studio's static page in headless Chromium: size, first picture, answers to a drag, numbers against Python's.
 
 `first_picture_s` counts until the first futures are drawn, `network_ready_s` until others can be; `drag_ms` from
-the pointer's event until the new futures are drawn, one after the other around the object.
+the pointer's event until the new futures are drawn, one after the other around the object; `imagined_ms` is what the
+network and all before it takes of that, `frame_ms` the time from one picture to the next while time runs.
 Needs `pip install playwright`, Chromium and npm, or --onnxruntime-web.
 """
 
@@ -27,6 +28,15 @@ DRAG = """async (count) => {
   return taken;
 }"""
 
+FRAMES = """async (count) => {
+  const next = () => new Promise(requestAnimationFrame), taken = [];
+  for (let k = 0, last = await next(); k < count; k++) {
+    const now = await next();
+    taken.push(now - last);
+    last = now;
+  }
+  return taken;
+}"""
 LISTEN = """() => {
   const found = window.found = { taken: [], asked: null, shown: false };
   document.getElementById("canvas").addEventListener("pointermove", (event) => {
@@ -97,7 +107,7 @@ def main() -> None:
         "viewport": {"width": options.width, "height": round(options.width * 0.6)},
         "color_scheme": "dark" if options.dark else "light",
     }
-    first, ready, found, taken, followed = [], [], [], [], []
+    first, ready, found, taken, followed, shown = [], [], [], [], [], []
     with TemporaryDirectory() as folder:
         page = write_static_page(Path(folder), options.onnxruntime_web)
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
@@ -110,6 +120,7 @@ def main() -> None:
                     continue
                 found = visited.evaluate(IMAGINE, [as_page_choices(each) for each in cases])
                 taken = visited.evaluate(DRAG, options.drags)
+                shown = visited.evaluate(FRAMES, options.drags)
                 followed = drag(visited, options.drags)
                 if options.picture is not None:
                     visited.uncheck("#play")
@@ -126,6 +137,7 @@ def main() -> None:
                 "first_picture_s": [each / 1000 for each in first],
                 "network_ready_s": [each / 1000 for each in ready],
                 "imagined_ms": summary(taken),
+                "frame_ms": summary(shown),
                 "drag_ms": summary(followed),
                 "cases": len(cases),
                 "refused_alike": sum(

@@ -7,7 +7,7 @@ import numpy as np
 
 from foretrace.errors import StudioError
 from foretrace.objects import Prism
-from foretrace.studio.controls import Controls
+from foretrace.studio.controls import OWN, Controls
 from foretrace.studio.shapes import MOST_CORNERS, prism_of
 from foretrace.studio.stage import Stage
 
@@ -66,6 +66,8 @@ class Drawing:
         controls = self._controls
         controls.draw.visible = not begins
         controls.drawn.visible = controls.undraw.visible = begins
+        if begins:
+            controls.example.value = OWN  # so that any example gives it up, the former one, too
         self._stage.clear(begins)
         self._stage.show_drawing(np.zeros((0, 2)))
         self._scene.remove_click_callback("all")
