@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ TEXTS = (
     "1 2 3\n4",
     "0,0;0.1,0;0.1,0.1",
 )
+PATIENCE = 300
+"""Time until a picture has to come [s]: plans that were asked for may have to be made before."""
 EXAMPLES = ("pentagon", "heptagon", "hdd", "pcb", "book", "racket", "bracket", "disc", "box")
 
 
@@ -83,9 +86,25 @@ def memory(process: subprocess.Popen) -> float:
     return int(status.split("VmRSS:")[1].split()[0]) / 1024
 
 
-def main() -> int:
+def visit(address: str, actions: int, rng: np.random.Generator) -> Counter[str]:
+    """The actions of one visitor, who waits in the end until a drag has moved the contact."""
     from studio_visitor import Visitor
 
+    done = Counter()
+    with Visitor(address) as visitor:
+        visitor.look(lambda: "/rim" in visitor.nodes, PATIENCE)
+        for _ in range(actions):
+            done[act(visitor, rng)] += 1
+            visitor.look(seconds=float(rng.uniform(0.0, 0.15)))
+        visitor.set("example", "book")
+        visitor.look(seconds=0.5)
+        before = visitor.drawn
+        visitor.drag(0.2, 0.0)
+        visitor.look(lambda: visitor.drawn > before, PATIENCE)
+    return done
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--actions", type=int, default=1000)
     parser.add_argument(
@@ -93,26 +112,18 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    rng, done, used = np.random.default_rng(options.seed), {}, []
+    rng, done, used = np.random.default_rng(options.seed), Counter(), []
     program = [sys.executable, "-m", "foretrace", "studio", "--port", "0"]
     with tempfile.TemporaryFile("w+") as errors:
         with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=errors, text=True) as process:
             assert process.stdout is not None
-            address = process.stdout.readline().strip().removeprefix("http://")
-            for _ in range(options.visitors):
-                with Visitor(address) as visitor:
-                    visitor.look(lambda here=visitor: "/rim" in here.nodes, 120)
-                    for _ in range(options.actions // options.visitors):
-                        kind = act(visitor, rng)
-                        done[kind] = done.get(kind, 0) + 1
-                        visitor.look(seconds=float(rng.uniform(0.0, 0.15)))
-                    visitor.set("example", "book")
-                    visitor.look(seconds=0.5)
-                    before = visitor.drawn
-                    visitor.drag(0.2, 0.0)
-                    visitor.look(lambda here=visitor, before=before: here.drawn > before, 120)
-                used.append(round(memory(process), 1))
-            process.terminate()
+            try:
+                address = process.stdout.readline().strip().removeprefix("http://")
+                for _ in range(options.visitors):
+                    done += visit(address, options.actions // options.visitors, rng)
+                    used.append(round(memory(process), 1))
+            finally:
+                process.terminate()
         errors.seek(0)
         said = errors.read()
     print(json.dumps({"actions": done, "memory_mb": used, "errors": said[:4000]}, indent=2))

@@ -171,7 +171,7 @@ def visits(options: argparse.Namespace, faults: list[str]) -> dict[str, Any]:
             page.on("pageerror", lambda error: faults.append(str(error)))
             page.goto(f"http://{server.address}")
             page.get_by_text("levered", exact=True).first.wait_for(timeout=120_000)
-            page.get_by_label("play").uncheck()  # until a visitor ticks it again
+            page.get_by_label("play").uncheck(timeout=120_000)  # until a visitor ticks it again
             studio = next(iter(server.pages.values()))
             plain_light(studio)
             visit = Visit(page, studio, rng)

@@ -1,6 +1,6 @@
 """An outline that a visitor draws by clicking its corners on the table."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ class Drawing:
         self.active = False
         """Whether an outline is being drawn."""
 
-    def begin(self, clicked: Callable[[Any], None]) -> None:
+    def begin(self, clicked: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         """Clear the table, and wait for clicks on it."""
         self._switch(True)
         self._scene.on_click()(clicked)

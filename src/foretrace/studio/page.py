@@ -117,10 +117,9 @@ class Page:
     def _connect(self) -> None:
         controls = self.controls
         for name in ("exact", "imaginer", "goal", "example"):
-            _at_once(getattr(controls, name), lambda name=name: self._choose(name))
+            _on(getattr(controls, name), lambda name=name: self._choose(name))
         for handle in (controls.tubes, controls.twin, controls.rim, controls.arm):
             _on(handle, lambda: self.act(lambda: None))
-        _on(controls.time, lambda: self._show_time(float(controls.time.value)))
         _on(controls.draw, lambda: self.act(self._begin_outline))
         _on(controls.undraw, lambda: self.act(self._drawing.end))
         _on(controls.drawn, lambda: self.act(self._finish_outline))
@@ -211,7 +210,10 @@ class Page:
         return 0.001 * float(self.controls.height.value)
 
     def _begin_outline(self) -> None:
-        self._drawing.begin(lambda event: self.act(lambda: self._add_corner(event)))
+        async def clicked(event: Any) -> None:
+            self.act(lambda: self._add_corner(event))
+
+        self._drawing.begin(clicked)
         self._message = "click the corners of an outline on the table, in order"
 
     def _add_corner(self, event: Any) -> None:
@@ -364,12 +366,14 @@ class Page:
                 self.controls.show_verdict(watched, k)
 
     def _let_time_run(self) -> None:
-        """While `play` is on, until the visitor goes."""
+        """While `play` is on, until the visitor goes; else show the time that the visitor chooses."""
         now, last = float(self.controls.time.value), perf_counter()
         while not self._closed.wait(FRAME):
             elapsed, last = perf_counter() - last, perf_counter()
             if not self.controls.play.value or self._drawing.active:
-                now = float(self.controls.time.value)
+                if (chosen := float(self.controls.time.value)) != now:
+                    self._show_time(chosen)
+                now = chosen
                 continue
             end = float(self.controls.time.max)
             now = 0.0 if now > end + PAUSE else now + elapsed
@@ -378,19 +382,10 @@ class Page:
 
 
 def _on(handle: Any, work: Callable[[], None]) -> None:
-    """Do something when the visitor, not the page, uses a button or changes a value."""
+    """Do something short, in the order of messages, when the visitor, not the page, uses a control."""
     listen = getattr(handle, "on_click", None) or handle.on_update
 
     @listen
-    def _(event: Any) -> None:
-        if event.client_id is not None:
-            work()
-
-
-def _at_once(handle: Any, work: Callable[[], None]) -> None:
-    """Do something short in the thread that takes in messages, in their order, when the visitor changes a value."""
-
-    @handle.on_update
-    async def _(event: Any) -> None:
+    async def _(event: Any) -> None:  # other functions are called by many threads, in any order
         if event.client_id is not None:
             work()
