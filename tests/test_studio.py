@@ -501,21 +501,35 @@ def test_a_choice_that_is_made_while_something_is_drawn_is_kept(served):
         visitor.look(lambda: "goal:move" in visitor.value("link"))
 
 
+def test_choices_are_taken_in_their_order(served):
+    with visit(served) as visitor:
+        page, drawn = list(served.pages.values())[-1], Event()
+        page.act(drawn.wait)
+        visitor.set("example", "disc")
+        visitor.click("draw an outline")
+        visitor.set("example", "book")  # gives the drawing up
+        visitor.look(seconds=0.5)
+        drawn.set()
+        visitor.look(lambda: "object:book" in visitor.value("link"))
+
+
 def test_work_is_done_in_its_order_and_goes_on_after_a_fault(capfd):
-    queue, begin, done = WorkQueue(), Event(), []
+    queue, begin, last, done = WorkQueue(), Event(), Event(), []
 
     def work(number: int) -> None:
         begin.wait()
         done.append((number, queue.is_latest(number)))
         if number == 2:
             raise RuntimeError("a fault of the second")
+        if number == 4:
+            last.set()
 
     for _ in range(4):
         queue.add(work)
     begin.set()
+    assert last.wait(5)
     queue.end()
-    queue.thread.join(5)
-    assert not queue.thread.is_alive()
+    queue.add(work)
     assert done == [(1, False), (2, False), (3, False), (4, True)]
     assert "RuntimeError: a fault of the second" in capfd.readouterr().err
 
@@ -529,7 +543,7 @@ def test_a_page_ends_with_its_visitor(served):
     with visit(served) as visitor:
         page = list(served.pages.values())[-1]
         visitor.look(seconds=0.1)
-    for thread in (page._player, page._work.thread):
+    for thread in (page._player, *page._work._thread._threads):
         thread.join(5)
         assert not thread.is_alive()
     assert page not in served.pages.values()

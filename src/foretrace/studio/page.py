@@ -53,7 +53,6 @@ class Page:
         self._client, self._data, self._address = client, data, address
         self._work, self._closed = WorkQueue(), Event()
         self._dragged: tuple[np.ndarray, bool] | None = None
-        self._chosen: dict[str, Any] = {}
         self._told = -1
         self._message = ""
         self._photo: PhotoView | None = None
@@ -104,15 +103,14 @@ class Page:
     def _choose(self, name: str) -> None:
         """Note at once what the visitor has chosen: what is drawn meanwhile shows the former choice again."""
         slider = self.controls.sliders.get(name)
-        self._chosen[name] = slider.value if slider else getattr(self.controls, name).value
-        self.act(lambda: self._take_choice(name))
+        value = slider.value if slider else getattr(self.controls, name).value
+        self.act(lambda: self._take_choice(name, value))
 
-    def _take_choice(self, name: str) -> None:
-        value = self._chosen.pop(name, OWN)  # a later choice of the same may have been taken already
-        if name == "example" and value != OWN:
-            self._take(example(value))
-        elif value != OWN:
+    def _take_choice(self, name: str, value: Any) -> None:
+        if name != "example":
             self.session.change(**{name: value})
+        elif value != OWN:
+            self._take(example(value))
 
     def _connect(self) -> None:
         controls = self.controls

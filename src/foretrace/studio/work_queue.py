@@ -2,8 +2,8 @@
 
 import traceback
 from collections.abc import Callable
-from queue import SimpleQueue
-from threading import Lock, Thread
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
 
 
 class WorkQueue:
@@ -14,29 +14,29 @@ class WorkQueue:
     """
 
     def __init__(self) -> None:
-        self._waiting: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._adding, self._latest = Lock(), 0
-        self.thread = Thread(target=self._run, daemon=True, name="foretrace-studio-work")
-        """Where the work is done."""
-        self.thread.start()
+        self._thread = ThreadPoolExecutor(1, "foretrace-studio-work")
+        self._adding, self._latest, self._ended = Lock(), 0, False
 
     def add(self, work: Callable[[int], None]) -> None:
-        """Do something after all that was added before; it is given its number."""
+        """Do something after all that was added before, unless the queue has ended; it is given its number."""
         with self._adding:
-            self._latest = number = self._latest + 1
-            self._waiting.put(lambda: work(number))
+            if not self._ended:
+                self._latest += 1
+                self._thread.submit(_do, work, self._latest)
 
     def is_latest(self, number: int) -> bool:
         """Whether nothing was added after the work of this number."""
         return number == self._latest
 
     def end(self) -> None:
-        """End the thread after what was added before."""
-        self._waiting.put(None)
+        """Forget what waits, and end the thread after what is being done."""
+        with self._adding:
+            self._ended = True
+            self._thread.shutdown(wait=False, cancel_futures=True)
 
-    def _run(self) -> None:
-        while (work := self._waiting.get()) is not None:
-            try:
-                work()
-            except Exception:
-                traceback.print_exc()  # and go on with the next
+
+def _do(work: Callable[[int], None], number: int) -> None:
+    try:
+        work(number)
+    except Exception:
+        traceback.print_exc()
