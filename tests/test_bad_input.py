@@ -34,7 +34,7 @@ from foretrace.interactions.splits import (
 from foretrace.perception.board import Board
 from foretrace.perception.importing import ImportConfig
 from foretrace.perception.photo import PhotoConfig
-from foretrace.predictor import EffectPredictor, PredictorConfig
+from foretrace.predictor import EffectPredictor, PredictorConfig, fit_predictor
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.recording import RecordingConfig
 
@@ -134,6 +134,10 @@ REFUSED = {
         "precision is 'fp16'": lambda: ft.TrainConfig(precision="fp16"),
         "learning_rate is inf": lambda: ft.TrainConfig(learning_rate=np.inf),
         "learning_rate is 1e+308": lambda: ft.TrainConfig(learning_rate=1e308),
+        "batch of type str: give InteractionBatch": lambda: fit_predictor("few", LSTM, None),
+        "split of type NoneType: give Split": lambda: fit_predictor(
+            fake_batch(np.random.default_rng(0), 4), LSTM, None
+        ),
         "state is 'poses'": lambda: ft.LstmConfig(state="poses"),
         "residual is 'no'": lambda: ft.LstmConfig(residual="no"),
         "mirrored is None": lambda: ft.OneShotConfig(mirrored=None),
@@ -171,6 +175,8 @@ REFUSED = {
         "start = 1e+308 is outside": lambda: ImportConfig(start=1e308),
     },
     PredictionError: {
+        "shared of type NoneType: give names of constants": lambda: ft.Belief().of_another_object(None),
+        "shared of type str: give names of constants": lambda: ft.Belief().of_another_object("friction"),
         "context is 'nominal': give values by name": lambda: ft.load_predictor().imagine(VIEW, context="nominal"),
         "start is array([0., 0.]): choose from": lambda: ft.load_predictor().imagine_batch(
             ft.InteractionBatch.from_views([VIEW]), np.zeros(2)

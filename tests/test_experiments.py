@@ -33,8 +33,10 @@ from foretrace.evaluation.storage import (
     read_rows,
     table_of,
 )
+from foretrace.experiments.novel_families import family_of
 from foretrace.experiments.training import Recipe
 from foretrace.experiments.transfer_objects import PENTAGON, Subject
+from foretrace.objects import Box, Cylinder, Footed, Prism
 from foretrace.predictor import save_checkpoint, train_predictor
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
@@ -220,6 +222,43 @@ def test_an_unknown_option_or_a_file_in_the_way_is_no_traceback(label: str, tmp_
     assert f"; `foretrace evaluate {label} --help` lists the options" in told
     # Where options are required, the missing ones come first.
     assert ("Missing" if label in ("predictor", "reconstruction", "pushes") else "--levitate") in told
+
+
+@pytest.mark.parametrize(
+    ("label", "options", "words"),
+    [
+        ("identified-world", "--seed -1", "seed -1 is negative: choose seeds from 0"),
+        ("identification", "--seed -1", "seed -1 is negative: choose seeds from 0"),
+        (
+            "monitoring",
+            "--false-alarms 2",
+            "false_alarms is 2.0: give a share of executions from 0.01 to 0.5",
+        ),
+        (
+            "monitoring",
+            "--false-alarms nan",
+            "false_alarms is nan: give a share of executions from 0.01 to 0.5",
+        ),
+    ],
+)
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_a_value_out_of_range_is_refused_before_anything_runs(label, options, words, dry, tmp_path, capsys):
+    assert cli.main(["evaluate", label, *options.split(), "--out", str(tmp_path / "out"), *dry]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("obj", "family"),
+    [
+        (Box(0.1, 0.1, 0.02), "solid"),
+        (Footed(Prism([(0, 0), (0.1, 0), (0, 0.1)])), "few corners"),
+        (Cylinder(0.03, 0.1), "solid"),
+    ],
+)
+def test_objects_of_every_kind_have_a_family(obj, family):
+    assert family_of(obj.to_dict()) == family
+    assert family_of({"kind": "mesh"}) == ""
 
 
 # --- the mechanism --------------------------------------------------------------------------------------------

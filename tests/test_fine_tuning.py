@@ -1,6 +1,7 @@
 """A predictor that was trained before learns from further interactions."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,8 +143,9 @@ def test_its_recommended_settings_are_those_of_fine_tuning(initial):
     assert _loop_settings(CONFIGS["lstm"].make(20), None) is CONFIGS["lstm"].training
 
 
-def test_the_command(initial, tmp_path, capsys):
-    fake_data_set(tmp_path / "data", num_samples=20)
+@pytest.mark.parametrize("samples", [20, 14])
+def test_the_command(initial, tmp_path, capsys, samples):
+    fake_data_set(tmp_path / "data", num_samples=samples)
     words = [
         "train",
         "--initial",
@@ -171,3 +173,25 @@ def test_settings_of_the_predictor_are_refused_beside_it(initial, tmp_path, caps
     words = ["train", "--initial", str(initial), "--data", "nowhere", "--out", str(tmp_path / "run"), *option]
     assert main(words) == 2
     assert f"{option[0]} and --initial do not go together" in capsys.readouterr().err
+
+
+def test_a_training_does_not_begin_where_it_starts_from(initial, tmp_path, capsys):
+    run = tmp_path / "seed-0"
+    shutil.copytree(initial, run)
+    fake_data_set(tmp_path / "data", num_samples=20)
+    words = ["train", "--initial", str(run), "--data", str(tmp_path / "data"), "--fresh", "--out"]
+    for rest in ([str(run)], [str(tmp_path), "--seeds", "0"]):
+        assert main([*words, *rest]) == 2
+        assert f"--initial {run} is where the training is to go" in capsys.readouterr().err
+    assert (run / "model.safetensors").read_bytes() == (initial / "model.safetensors").read_bytes()
+
+
+def test_data_without_its_outcomes_are_refused(batch, tmp_path, capsys):
+    initial = train_predictor(batch, CONFIGS["lstm"], tmp_path / "initial", FIRST, progress=False)
+    data = fake_data_set(tmp_path / "data", num_samples=20)
+    words = ["train", "--initial", str(initial), "--data", str(data), "--out", str(tmp_path / "run")]
+    assert main([*words, "--outcomes", "tumbled"]) == 2
+    assert (
+        f"{data} has the outcomes levered, slipped, the predictor to start from learns tumbled: give data of its action"
+        in " ".join(capsys.readouterr().err.split())
+    )

@@ -85,6 +85,22 @@ def test_a_belief_in_place_of_values(
     assert words in " ".join(capsys.readouterr().err.split())
 
 
+def test_the_bevel_is_the_object_s_and_is_told(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = f"plan --polygon outline.txt {' '.join(QUICK)}"
+    assert run(f"{words} --bevel-width 0.008 --bevel-height 0.0025") == 0
+    found = ft.Plan.open("plan/plan.json")
+    assert (found.object.bevel.width, found.object.bevel.height) == (0.008, 0.0025)
+    assert found.imagined.context["bevel_width"] == pytest.approx(0.008)
+    assert found.imagined.context["friction"] == pytest.approx(0.8)
+    assert run(f"{words} --bevel-width 0.5") == 2
+    assert (
+        "leaves no bottom face (widest inner circle has radius 0.06685 m): give a smaller --bevel-width"
+        in (" ".join(capsys.readouterr().err.split()))
+    )
+    assert run("plan --data none --every --bevel-width 0.008") == 2
+    assert "leave out --bevel-width, or --every" in " ".join(capsys.readouterr().err.split())
+
+
 def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = "plan --polygon outline.txt --action push --goal move-to --position 0.09 0.06 --turn 0.6"
     assert run(f"{command} --steps 3 --spacing 0.04 --refine 1 --samples 16 --tool-friction 0.25") == 0

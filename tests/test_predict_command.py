@@ -18,6 +18,7 @@ from PIL import Image
 import foretrace as ft
 from foretrace import cli
 from foretrace.geometry import quaternion_to_matrix, rotation_vector_to_quaternion
+from foretrace.imagined import Imaginer
 from foretrace.imagined.futures import carried_poses
 from foretrace.imagined.observed import rotations_since_rest
 from foretrace.perception.example import CONTACT, HEIGHT, MASK, SCALE
@@ -150,7 +151,10 @@ def test_the_bevel_is_the_object_s_and_is_told(tmp_path: Path, capsys: pytest.Ca
     assert 0.0002 < apart < 0.02
     capsys.readouterr()
     assert cli.main([*command, str(tmp_path / "high"), "--bevel-height", "0.5"]) == 2
-    assert "bevel of height 0.5 m" in capsys.readouterr().err
+    assert (
+        "bevel of height 0.5 m on an object of height 0.018 m: give a smaller --bevel-height, or leave it out"
+        in (" ".join(capsys.readouterr().err.split()))
+    )
     box = tmp_path / "box.stl"
     trimesh.creation.box((0.1, 0.08, 0.03)).export(box)
     assert (
@@ -189,3 +193,37 @@ def test_what_cannot_be_predicted_is_refused(
     told = capsys.readouterr().err
     assert message in told
     assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(("outline", "height", "wide", "high"), [
+    ("0 0\n0.15 0\n0.15 0.016\n0 0.016\n", 0.02, 0.004, 0.004 / 3),
+    ("0 0\n0.15 0\n0.15 0.14\n0 0.14\n", 0.003, 0.0045, 0.0015),
+    ("0 0\n0.15 0\n0.15 0.14\n0 0.14\n", 0.02, 0.009, 0.003),
+])  # fmt: skip
+@pytest.mark.parametrize("many", [False, True])
+def test_a_slender_or_thin_outline_has_the_bevel_that_it_bears(
+    tmp_path, monkeypatch, outline, height, wide, high, many
+):
+    (tmp_path / "outline.txt").write_text(outline)
+    told = []
+    name = "imagine_candidates" if many else "imagine"
+    own = getattr(Imaginer, name)
+    monkeypatch.setattr(
+        Imaginer, name, lambda *args, **known: told.append(known["context"]) or own(*args, **known)
+    )
+    at = ["--contacts", "2"] if many else ["--edge", "0", "--no-animation"]
+    words = ["predict", "--polygon", str(tmp_path / "outline.txt"), "--height", str(height), *at]
+    assert cli.main([*words, "--out", str(tmp_path / "out")]) == 0
+    assert [told[0][name] for name in ("bevel_width", "bevel_height")] == pytest.approx([wide, high])
+
+
+@pytest.mark.parametrize(
+    ("speed", "words"), [("0.3", "takes 8.32 s, of which the first 5.6 s are imagined"), ("0.6", "")]
+)
+def test_an_action_that_is_cut_short_is_pointed_out(tmp_path, capsys, speed, words):
+    (tmp_path / "outline.txt").write_text("0 0\n0.15 0\n0.15 0.14\n0 0.14\n")
+    command = ["predict", "--polygon", str(tmp_path / "outline.txt"), "--edge", "0", "--no-animation"]
+    assert cli.main([*command, "--speed", speed, "--out", str(tmp_path)]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert words in said
+    assert ("of which the first" in said) == bool(words)

@@ -18,7 +18,7 @@ from fastapi.testclient import TestClient
 
 from foretrace.studio import watches
 from foretrace.studio.bodies import PredictBody
-from foretrace.studio.service import MOST_BYTES, make_service
+from foretrace.studio.service import MOST_BYTES, imagine, make_service
 from foretrace.studio.session import Session
 
 CORNERS = [[0.09, 0.0], [0.02, 0.08], [-0.07, 0.05], [-0.08, -0.04], [0.03, -0.08]]
@@ -135,6 +135,23 @@ def test_bodies_are_bounded_and_have_to_be_json(client):
         headers={"content-type": "application/json"},
     )
     assert infinite.status_code == 422
+
+
+def test_a_monitor_knows_its_context(client, monkeypatch):
+    beliefs = []
+    monkeypatch.setattr(
+        "foretrace.studio.service.imagine",
+        lambda obj, action, context: beliefs.append(context) or imagine(obj, action, context),
+    )
+    for context in ({"friction": 0.7, "contact_error": 0}, "unknown", None):
+        assert client.post("/monitors", json=KNOWN | {"worlds": 8, "context": context}).status_code == 201
+    told, unknown, nothing = beliefs
+    assert told.ranges["friction"] == (0.7, 0.7)
+    assert told.ranges["contact_left"] == (0, 0)
+    assert told.ranges["density"] == unknown.ranges["density"] == ft.Belief().ranges["density"]
+    assert unknown.ranges == nothing.ranges == ft.Belief().ranges
+    wrong = client.post("/monitors", json=KNOWN | {"context": {"contact_error": 0.002}})
+    assert "context contact_error is 0.002" in wrong.json()["detail"]
 
 
 def test_monitors_are_bounded_in_number_and_life(monkeypatch):

@@ -123,7 +123,10 @@ def test_objects_come_from_text_masks_and_meshes():
         np.ptp(from_file("m.png", SQUARE, scale=0.001).corners, axis=0), [0.12, 0.1], atol=0.002
     )
     box = trimesh.creation.box((80, 60, 20)).export(file_type="stl")
-    assert isinstance(from_file("part.STL", box, scale=0.001), ft.MeshObject)
+    mesh = from_file("part.STL", box, scale=0.001)
+    assert isinstance(mesh, ft.MeshObject)
+    told = Choices(object=mesh).context
+    assert (told["bevel_width"], told["bevel_height"]) == (mesh.bevel.width, mesh.bevel.height)
     assert from_file("t.csv", TRIANGLE.replace(" ", ",").encode(), height=0.03).height == 0.03
 
 

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from foretrace.actions import Action
     from foretrace.imagined import ImaginedBatch, Imaginer
     from foretrace.interactions.topdown import TopDownView
+    from foretrace.objects import ObjectModel
 
 TABLE = "predictions.csv"
 MOST_CONTACTS = 10_000
@@ -58,7 +59,7 @@ def predict_many(
     obj: ObjectOptions,
     at: ContactOptions,
     many: ManyOptions,
-    told: Mapping[str, float],
+    told: Callable[["ObjectModel"], Mapping[str, float]],
     path: Any,
     out: Path,
 ) -> None:
@@ -69,7 +70,7 @@ def predict_many(
         obj: The object, or how the images are read.
         at: The contact, where the options give none.
         many: Objects and contacts.
-        told: Context.
+        told: The context of an object.
         path: The tool's path.
         out: Folder of the table.
 
@@ -124,7 +125,7 @@ def _predict(
     given: ObjectOptions,
     at: ContactOptions,
     contacts: int | None,
-    told: Mapping[str, float],
+    told: Callable[["ObjectModel"], Mapping[str, float]],
     path: Any,
 ) -> list[Row]:
     """The rows of one object."""
@@ -138,7 +139,7 @@ def _predict(
     )
     actions = [replace(action, path=path) for action in actions]
     imagined = predictor.imagine_candidates(
-        view, scene.in_view(actions), context=dict(told), com=scene.com_in_view if mask is None else None
+        view, scene.in_view(actions), context=told(obj), com=scene.com_in_view if mask is None else None
     )
     return [_row(name, action, imagined, k) for k, action in enumerate(actions)]
 

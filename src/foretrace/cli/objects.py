@@ -45,8 +45,9 @@ class ObjectOptions:
             ShapeError: The object cannot be used.
         """
         from foretrace.objects import MeshObject, Prism
+        from foretrace.objects.model import fitting_bevel
         from foretrace.objects.polygon_files import read_polygon
-        from foretrace.objects.prism import DEFAULT_HEIGHT
+        from foretrace.objects.prism import DEFAULT_HEIGHT, check_polygon
         from foretrace.objects.shape_files import read_silhouette_image
 
         given = [f"--{name}" for name in ("polygon", "image", "mesh") if getattr(self, name) is not None]
@@ -66,7 +67,8 @@ class ObjectOptions:
             )
         height = DEFAULT_HEIGHT if self.height is None else self.height
         if self.polygon is not None:
-            return Prism(read_polygon(self.polygon, self.scale), height), None
+            corners = check_polygon(read_polygon(self.polygon, self.scale))
+            return Prism(corners, height, fitting_bevel(corners, height)), None
         if self.mesh is not None:
             return MeshObject.load(self.mesh, 1.0 if self.scale is None else self.scale, rest=self.rest), None
         if self.scale is None or self.image is None:

@@ -9,11 +9,12 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from foretrace.cli.console import say
-from foretrace.cli.context import PhysicsOptions, option_name
+from foretrace.cli.context import PhysicsOptions, bevelled, option_name
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.cli.plan_many import EveryOptions, Task, plan_every
 from foretrace.errors import DatasetError, PlanningError
+from foretrace.imagined.context import BEVELS
 from foretrace.imagined.shown import radius_of
 from foretrace.perception.photo import PhotoConfig
 from foretrace.planning import PlanConfig, goals
@@ -162,14 +163,16 @@ def plan(
 
     goal = aim.load()
     if many.every:
-        _refuse_with_every(obj, photo, where, steps)
+        _refuse_with_every(obj, photo, where, physics, steps)
         seen = thing = T_table_object = None
     else:
         if idle := [option_name(name) for name in ("workers", "cluster") if getattr(many, name) is not None]:
             raise PlanningError(f"{' and '.join(idle)} without --every: leave it out")
         seen, thing, T_table_object = _observe(obj, photo, where)
     predictor = imaginer_of(run, action, steps)
-    told = physics.context(predictor, aim.goal == "learn", unknown)
+    told = physics.context(predictor, aim.goal == "learn", unknown, thing)
+    if thing is not None:
+        thing = bevelled(thing, physics.given)
     if thing is None or steps != 1:
         if not isinstance(told, Mapping | None):
             raise PlanningError(
@@ -203,7 +206,9 @@ def plan(
     print("\n".join(str(out / name) for name in written))
 
 
-def _refuse_with_every(obj: ObjectOptions, photo: PhotoOptions, where: PlaceOptions, steps: int) -> None:
+def _refuse_with_every(
+    obj: ObjectOptions, photo: PhotoOptions, where: PlaceOptions, physics: PhysicsOptions, steps: int
+) -> None:
     """Refuse options that are about one object.
 
     Raises:
@@ -213,6 +218,7 @@ def _refuse_with_every(obj: ObjectOptions, photo: PhotoOptions, where: PlaceOpti
         raise PlanningError("--every plans for the objects of a data set: give it as --data")
     one = {name for name in ("id", "pose", "base") if getattr(where, name) is not None}
     one |= {name for name, value in vars(obj).items() if value != getattr(ObjectOptions(), name)}
+    one |= physics.given.keys() & {*BEVELS}
     one |= {"photo"} if photo.photo is not None else set()
     one |= {"steps"} if steps != 1 else set()
     if one:

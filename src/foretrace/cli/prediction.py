@@ -3,6 +3,7 @@
 import csv
 import io
 from dataclasses import asdict, field, fields, make_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,12 +13,13 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from foretrace.actions import LeverUp
 from foretrace.cli.batch import ManyOptions, predict_many
 from foretrace.cli.contact import ContactOptions
+from foretrace.cli.context import bevel_of, bevelled
 from foretrace.cli.example import say_example, write_example
 from foretrace.cli.futures import say_futures
 from foretrace.cli.objects import ObjectOptions, PhotoOptions
 from foretrace.cli.parsing import adapt
 from foretrace.errors import PredictionError
-from foretrace.imagined.context import BEVELS, EXACT, context_units, nominal_constants
+from foretrace.imagined.context import EXACT, context_units, nominal_constants
 from foretrace.imagined.shown import LEVEL, radius_of
 from foretrace.perception.example import EXAMPLE
 from foretrace.perception.photo import PhotoConfig
@@ -92,7 +94,6 @@ def predict(
         obj, at = write_example(out / EXAMPLE)
     predictor = load_imaginer(run)
     values = _given_context(asdict(context), predictor.context, compare)
-    told = _told(values, predictor.context, unknown)
     kind = predictor.action
     path = kind.path_of(
         **{name: value for name, value in values.items() if name in kind.nominal_parameters()}
@@ -100,7 +101,7 @@ def predict(
     if _changed(many):
         if idle := [*photo.given(), *["--compare"] * compare]:
             raise PredictionError(f"--images and --contacts go without {', '.join(idle)}: leave it out")
-        predict_many(predictor, obj, at, many, told, path, out)
+        predict_many(predictor, obj, at, many, partial(_told, values, predictor.context, unknown), path, out)
         return
     seen = None
     if photo.photo is not None:
@@ -117,7 +118,8 @@ def predict(
             raise PredictionError(f"{', '.join(idle)} goes with --photo: give one, or leave it out")
         object, action, view, com = _object_and_action(obj, at, kind)
     action = replace(action, path=path)
-    object = _bevelled(object, values)
+    object = bevelled(object, values)
+    told = _told(values, predictor.context, unknown, object)
     imagined = predictor.imagine(view, action, context=told, com=com)
     truth = _simulate(object, action, values) if compare else None
     say_futures(imagined)
@@ -212,31 +214,12 @@ def _given_context(
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _told(given: dict[str, float], context: tuple[str, ...], unknown: bool) -> dict[str, float]:
-    """What the predictor is told: values that were given, and nominal constants unless only the former are known."""
-    usual = {} if unknown else {name: value for name, value in nominal_constants().items() if name in context}
-    return usual | {name: value for name, value in given.items() if name in context}
-
-
-def _bevelled(obj: "ObjectModel", given: dict[str, float]) -> "ObjectModel":
-    """The object with the bevel that was given.
-
-    Raises:
-        PredictionError: It is no prism.
-        ShapeError: It bears no such bevel.
-    """
-    from foretrace.objects import Bevel, Prism
-
-    found = [name for name in BEVELS if name in given]
-    if not found:
-        return obj
-    if type(obj) is not Prism:
-        option = f"--{found[0].replace('_', '-')}"
-        raise PredictionError(f"{option} is for outlines; the object is a {type(obj).__name__}: leave it out")
-    width, height = (
-        given.get(name, own) for name, own in zip(BEVELS, (obj.bevel.width, obj.bevel.height), strict=True)
-    )
-    return Prism(obj.corners, obj.height, Bevel(width, height))
+def _told(
+    given: dict[str, float], context: tuple[str, ...], unknown: bool, obj: "ObjectModel"
+) -> dict[str, float]:
+    """What the predictor is told: what was given; and, unless that alone is known, own bevel and nominal constants."""
+    usual = {} if unknown else {**nominal_constants(), **bevel_of(obj)}
+    return {name: value for name, value in {**usual, **given}.items() if name in context}
 
 
 def _simulate(obj: "ObjectModel", action: "Action", given: dict[str, float]) -> "Interaction":

@@ -110,6 +110,10 @@ def train_command(words: Sequence[str]) -> Callable[..., None]:
                     f"{given_twice[0]} and --initial do not go together: the predictor stays as {initial} has it"
                 )
         folders = [out]
+        if initial is not None and folder_of(initial).resolve() in {
+            each.resolve() for each in (out, *(out / f"seed-{seed}" for seed in several.seeds))
+        }:
+            raise TrainingError(f"--initial {initial} is where the training is to go: give another --out")
         if not (named <= {"--data", "--out", "--card"} and card and RunFolder(out).finished):
             if "--epochs" in named and "--min-steps" not in named:
                 training = replace(training, min_steps=1)  # who asks for one epoch gets one
@@ -272,6 +276,11 @@ def _train_one(
     config = predictor.config if isinstance(predictor, EffectPredictor) else predictor
     outcomes = training.outcomes or getattr(config, "outcomes", None) or (str(Outcome.LEVERED),)
     everything = cast(Dataset, first_of(_open(data), training.first))
+    if isinstance(start, Path) and not {*outcomes} & {*(there := everything.outcomes())}:
+        raise TrainingError(
+            f"{data} has the outcomes {', '.join(there) or 'of nothing'}, the predictor to start from learns "
+            f"{', '.join(outcomes)}: give data of its action, or train anew, without --initial"
+        )
     # Without any of them the training itself says which outcomes there are.
     dataset = everything.where(outcome=outcomes) or everything
     if split is None:

@@ -22,7 +22,7 @@ from rich.console import Console
 
 import foretrace
 from foretrace.errors import ForetraceError, ResultsError, shown
-from foretrace.evaluation.experiment import Experiment, Row, Trial
+from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds
 from foretrace.evaluation.storage import Rows, Store, kept_identity, table_of
 from foretrace.files import as_json, versions_of
 from foretrace.predictor.run_folder import git_commit
@@ -97,11 +97,18 @@ def run_experiment(
 
 def count_missing(experiment: Experiment, out: str | Path | None = None) -> dict[str, int]:
     """How many trials `run_experiment` would carry out, by the first setting of the trials."""
-    trials = list(dict.fromkeys(experiment.trials()))
+    trials = _trials_of(experiment)
     done = {} if out is None else _store(experiment, Path(out)).done()
     first = {trial: str(next(iter(trial.settings.values()))) for trial in trials}
     missing = Counter(name for trial, name in first.items() if trial not in done)
     return {name: missing[name] for name in dict.fromkeys(first.values())}
+
+
+def _trials_of(experiment: Experiment) -> list[Trial]:
+    """All that is asked for, each trial once."""
+    if (seed := getattr(experiment, "seed", None)) is not None:
+        checked_seeds([seed])
+    return list(dict.fromkeys(experiment.trials()))
 
 
 def _store(experiment: Experiment, out: Path, redraw: bool = False) -> Store:
@@ -126,7 +133,7 @@ def _run(
         raise ResultsError(f"threads is {threads}: give a number from 1")
     workers = experiment.workers if workers is None and not uses_cluster() else workers
     workers = count_workers(workers, ResultsError)
-    trials = [] if redraw else list(dict.fromkeys(experiment.trials()))
+    trials = [] if redraw else _trials_of(experiment)
     store = _store(experiment, out, redraw)
     done = store.done()
     missing = [trial for trial in trials if trial not in done]

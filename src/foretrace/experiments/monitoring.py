@@ -129,6 +129,10 @@ class Monitoring(Experiment):
                 f"executions is {self.executions}, faults is {self.faults}, successes is {self.successes}, recorded is "
                 f"{self.recorded}: give at least 1 of each"
             )
+        if not 0.01 <= self.false_alarms <= 0.5:
+            raise ResultsError(
+                f"false_alarms is {self.false_alarms}: give a share of executions from 0.01 to 0.5"
+            )
         known = (
             CALIBRATION,
             NORMAL,

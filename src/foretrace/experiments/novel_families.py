@@ -243,10 +243,14 @@ def _at_rim(mask: np.ndarray) -> bool:
 
 def family_of(obj: Mapping[str, Any]) -> str:
     """The family of an object, from its description; empty: one that is never held out."""
-    inner = obj["object"] if obj["kind"] == "weighted" else obj
+    inner = obj
+    while "object" in inner:  # weighted, or on feet
+        inner = inner["object"]
     if inner["kind"] in ("box", "cylinder"):
         return "solid"
-    corners = len(inner["corners"])
+    corners = len(inner.get("corners", ()))
+    if corners == 0:
+        return ""
     if corners > 10:
         return "round"
     return "few corners" if corners <= 4 else "many corners" if corners >= 9 else ""

@@ -96,7 +96,9 @@ class Belief:
         """Their weights, which sum to 1."""
         self.worlds = worlds
         """Number of draws that an imaginer imagines one action in."""
-        self.prior_std: Mapping[str, float] = self.std
+        self.prior_std: Mapping[str, float] = {
+            name: (pair[1] - pair[0]) / 12**0.5 for name, pair in limits.items()
+        }
         """Standard deviations before anything was observed."""
         self.ranges: Mapping[str, tuple[float, float]] = limits
         """Ranges of the prior."""
@@ -125,6 +127,7 @@ class Belief:
         Raises:
             PredictionError: One of them is no constant of the belief.
         """
+        check_type("shared", shared, (tuple, list), PredictionError, "names of constants")
         if unknown := [name for name in shared if name not in self.names]:
             raise PredictionError(
                 f"{shown(unknown[0])} is no constant of the belief: choose from {', '.join(self.names)}"
@@ -243,7 +246,7 @@ class Belief:
         if (
             set(found["values"]) != set(prior.names)
             or {len(each) for each in found["values"].values()} != {len(weights)}
-            or not (np.isfinite(weights).all() and weights.min(initial=np.inf) >= 0 < weights.sum())
+            or not (((weights >= 0) & (weights <= 1)).all() and weights.sum() > 0)
         ):
             raise PredictionError(f"{file} holds no belief: {REMEDY}")
         values = np.column_stack([found["values"][name] for name in prior.names])

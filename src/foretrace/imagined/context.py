@@ -292,3 +292,24 @@ def find_unconditioned(
                 "conditioned on it"
             )
     return tuple(map(tuple, warnings))
+
+
+def find_cut_short(
+    actions: Sequence[Action], times: Float[np.ndarray, " time"]
+) -> tuple[tuple[str, ...], ...]:
+    """Warnings about actions that take longer than the nominal one and than what is imagined.
+
+    Args:
+        actions: The actions.
+        times: Times of the imagined samples [s].
+
+    Returns:
+        The lines of each action.
+    """
+    end = float(times[-1])
+    return tuple(
+        (f"the action takes {each.duration:.3g} s, of which the first {end:.3g} s are imagined",)
+        if each.duration > max(end, type(each).nominal().duration) + SAME
+        else ()
+        for each in actions
+    )

@@ -196,11 +196,13 @@ def conformal_scores(
 
     Args:
         futures: Predicted futures.
-        com: Observed centres of mass [m].
+        com: Observed centres of mass [m], perhaps for a shorter time.
         lengths: Samples of each that count.
     """
-    apart = np.linalg.norm(futures.com - com[:, None], axis=-1) / (futures.spread + FLOOR)
-    valid = np.arange(com.shape[1]) < lengths[:, None]
+    count = com.shape[1]
+    apart = np.linalg.norm(futures.com[:, :, :count] - com[:, None], axis=-1)
+    apart = apart / (futures.spread[:, :, :count] + FLOOR)
+    valid = np.arange(count) < lengths[:, None]
     furthest = np.where(valid[:, None], apart, 0.0).max(axis=2)
     return np.where(futures.counted, furthest, np.inf).min(axis=1)
 

@@ -20,6 +20,7 @@ from foretrace.imagined.context import (
     UNKNOWN,
     Context,
     column_of,
+    find_cut_short,
     find_unconditioned,
     first_action,
     given_context,
@@ -345,19 +346,25 @@ class Imaginer(ABC):
         return np.where(none[:, None] & bevels, np.nan, values)
 
     def _answer(self, scenes: Scenes, parameters: dict[str, np.ndarray]) -> ImaginedBatch:
-        return self._warned(self.imagine_scenes(scenes), scenes.context, parameters)
+        return self._warned(self.imagine_scenes(scenes), scenes.context, parameters, scenes.actions)
 
     def _warned(
-        self, imagined: ImaginedBatch, context: np.ndarray, parameters: dict[str, np.ndarray]
+        self,
+        imagined: ImaginedBatch,
+        context: np.ndarray,
+        parameters: dict[str, np.ndarray],
+        actions: tuple[Action, ...] | None,
     ) -> ImaginedBatch:
         """Effects with warnings, also about paths that the imaginer is not conditioned on, and what it was told."""
         about_objects = imagined.warnings or ((),) * len(context)
         about_paths = (
             find_unconditioned(parameters, self.context, self.action) if parameters else ((),) * len(context)
         )
+        cut = ((),) * len(context) if actions is None else find_cut_short(actions, self.sample_times)
         errors = imagined.futures.expected_error()
         unsure = [(UNSURE_OF.format(100 * error),) if error > UNSURE else () for error in errors]
-        warnings = tuple(a + b + c for a, b, c in zip(about_objects, about_paths, unsure, strict=True))
+        about = zip(about_objects, about_paths, cut, unsure, strict=True)
+        warnings = tuple(sum(lines, ()) for lines in about)
         return replace(imagined, warnings=warnings, context=dict(zip(self.context, context.T, strict=True)))
 
     def _without(self, belief: Belief | None, context: Context | Belief) -> Context:
@@ -383,8 +390,7 @@ class Imaginer(ABC):
         count = belief.worlds
         futures = average_worlds(played.futures[np.arange(count)], count, com[None])
         worlds = gather_worlds(played, values, causes)
-        own = {name: np.array([value]) for name, value in parameters.items()}
-        answer = self._finish(futures, played.warnings[:1] or ((),), own, belief)
+        answer = self._finish(futures, played.warnings[:1] or ((),), (action,), belief)
         return replace(answer[0], worlds=worlds)
 
     def _average(
@@ -403,13 +409,13 @@ class Imaginer(ABC):
         together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
         wide = [np.broadcast_to(each.quantiles, (1, each.quantiles.shape[-1])) for each in parts]
         futures = replace(parts[0], **together, quantiles=np.concatenate(wide))
-        return self._finish(futures, tuple(warnings), parameters_of(actions), belief)
+        return self._finish(futures, tuple(warnings), actions, belief)
 
     def _finish(
         self,
         futures: Futures,
         warnings: tuple[tuple[str, ...], ...],
-        parameters: dict[str, np.ndarray],
+        actions: tuple[Action, ...],
         belief: Belief,
     ) -> ImaginedBatch:
         """Effects whose averaged futures these are, with warnings and what is told of their contexts."""
@@ -423,12 +429,12 @@ class Imaginer(ABC):
             warnings = tuple((*each, note) for each in warnings)
         best = futures.states[np.arange(len(futures)), futures.probability.argmax(axis=1)]
         pose = np.concatenate([best[..., :3], rotation_vector_to_quaternion(best[..., 3:])], axis=-1)
-        told = np.full((len(futures), len(self.context)), np.nan)
+        told, parameters = np.full((len(futures), len(self.context)), np.nan), parameters_of(actions)
         for column, name in enumerate(self.context):
             if name not in CONSTANTS and name in parameters:
                 told[:, column] = parameters[name]
         imagined = ImaginedBatch(self.sample_times, best[..., :3], pose, futures, warnings)
-        return self._warned(imagined, told, parameters)
+        return self._warned(imagined, told, parameters, actions)
 
     def _observe_batch(self, batch: InteractionBatch, count: int) -> Float[np.ndarray, "batch samples 6"]:
         """The first recorded samples of each motion at the imaginer's sample times."""

@@ -170,7 +170,7 @@ def _errors(predictor: EffectPredictor, test: InteractionBatch, families: Mappin
     truth = np.where(valid[..., None], test.com, np.nan)
     rows = []
     for start in STARTS:
-        imagined = predictor.imagine_batch(test, start).com
+        imagined = predictor.imagine_batch(test, start).com[:, : truth.shape[1]]
         full, final = (
             CM * np.asarray(measure(imagined, truth)) for measure in (mean_distance, final_distance)
         )

@@ -92,6 +92,8 @@ def fit_predictor(
     Raises:
         TrainingError: The predictor does not fit the data, or the loss is no longer finite.
     """
+    check_type("batch", batch, InteractionBatch, TrainingError)
+    check_type("split", split, Split, TrainingError)
     training = _loop_settings(predictor, training)
     with _made(predictor, training, batch, training.threads) as made:
         made.learned_from = _learned(made, batch, split)

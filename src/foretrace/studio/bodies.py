@@ -204,7 +204,8 @@ class MonitorBody(Known):
 
     action: ActionBody
     worlds: Annotated[int, Field(ge=0, le=256)] = 128
-    """Worlds of a belief over friction, density and execution error; 0: what is predicted in the context alone."""
+    """Worlds of a belief over friction, density and execution error, of which the context has what is known; 0: what
+    is predicted in the context alone."""
     false_alarms: Number = 0.05
     """Share of whole normal executions that alarm, at most."""
     rest: Annotated[list[Number], Field(min_length=7, max_length=7)] | None = None

@@ -12,7 +12,7 @@ from foretrace.actions.lever_up import VARIED_ACTION
 from foretrace.errors import StudioError, check_choices, check_type, is_number, shown
 from foretrace.imagined.belief import RANGES
 from foretrace.imagined.context import BEVELS, EXACT
-from foretrace.objects import Bevel, ObjectModel, Prism
+from foretrace.objects import Bevel, MeshObject, ObjectModel, Prism
 from foretrace.planning import goals
 from foretrace.studio.shapes import EXAMPLES, checked, example
 
@@ -103,7 +103,7 @@ class Choices:
     def context(self) -> dict[str, float]:
         """What an imaginer is told [SI]; what is unknown is left out."""
         told = {name: value for name in PHYSICS if (value := getattr(self, name)) is not None}
-        bevel = self.object.bevel if isinstance(self.object, Prism) else None
+        bevel = self.object.bevel if isinstance(self.object, Prism | MeshObject) else None
         own = {} if bevel is None else dict(zip(BEVELS, (bevel.width, bevel.height), strict=True))
         return told | own | ({EXACT: 0.0} if self.exact else {})
 

@@ -1,5 +1,6 @@
 """Predictions, plans and monitors over HTTP."""
 
+from collections.abc import Mapping
 from html import escape
 from threading import BoundedSemaphore
 from typing import Any
@@ -18,7 +19,8 @@ import foretrace
 from foretrace.errors import ForetraceError, StudioError
 from foretrace.geometry import transform_points
 from foretrace.imagined import Belief, ImaginedEffect
-from foretrace.imagined.context import told_of
+from foretrace.imagined.belief import EXECUTION
+from foretrace.imagined.context import CONSTANTS, EXACT, Context, given_context, told_of
 from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import Monitor, Verdict
 from foretrace.objects import ObjectModel, Prism
@@ -212,8 +214,8 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
     def begin(body: MonitorBody) -> Begun:
         """A monitor of one execution; give it every tracked sample."""
         obj = body.make_object()
-        belief = Belief(worlds=max(body.worlds, 2)) if body.worlds else None
-        imagined = imagine(obj, body.action, body.context if belief is None else belief)
+        context = _belief(body.context, max(body.worlds, 2)) if body.worlds else body.context
+        imagined = imagine(obj, body.action, context)
         monitor = Monitor(
             imagined,
             body.false_alarms,
@@ -265,6 +267,18 @@ def imagine(obj: ObjectModel, place: ActionBody, context: Any) -> ImaginedEffect
     com = transform_points(action.T_action_object, obj.mass_properties(1.0).com[None])[0]
     context = told_of(obj, learned().context) if context is None else context
     return learned().imagine(TopDownView.of(obj, action), action, context=context, com=com)
+
+
+def _belief(context: Context, worlds: int) -> Belief:
+    """A belief in which the constants of a context are known.
+
+    Raises:
+        PredictionError: A value is out of its range.
+    """
+    given_context(tuple(CONSTANTS), context, {}, optional=True)
+    known = dict(context) if isinstance(context, Mapping) else {}
+    exact = dict.fromkeys(EXECUTION, 0.0) if known.pop(EXACT, None) is not None else {}
+    return Belief({name: (value, value) for name, value in (known | exact).items()}, worlds=worlds)
 
 
 def _told(verdict: Verdict) -> dict[str, Any]:
