@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from foretrace.errors import PlanningError, PredictionError, ShapeError
 from foretrace.imagined.context import BEVELS
 
 if TYPE_CHECKING:
     from foretrace.imagined import Belief, Imaginer
-    from foretrace.objects import ObjectModel
 
 CONSTANTS = ("friction", "tool_friction", "density", *BEVELS)
 """Options that are constants."""
@@ -40,7 +39,7 @@ class PhysicsOptions:
         return {name: getattr(self, name) for name in CONSTANTS if getattr(self, name) is not None}
 
     def context(
-        self, imaginer: "Imaginer", learns: bool, unknown: bool, obj: "ObjectModel | None" = None
+        self, imaginer: "Imaginer", learns: bool, unknown: bool, obj: object = None
     ) -> "Mapping[str, float] | Belief | None":
         """What an imaginer is told.
 
@@ -87,7 +86,7 @@ def bevel_of(obj: object) -> dict[str, float]:
     return dict(zip(BEVELS, (obj.bevel.width, obj.bevel.height), strict=True))
 
 
-def bevelled(obj: "ObjectModel", given: Mapping[str, float]) -> "ObjectModel":
+def bevelled(obj: Any, given: Mapping[str, float]) -> Any:
     """The object with the bevel that was given.
 
     Raises:

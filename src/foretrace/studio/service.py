@@ -214,7 +214,9 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
     def begin(body: MonitorBody) -> Begun:
         """A monitor of one execution; give it every tracked sample."""
         obj = body.make_object()
-        context = _belief(body.context, max(body.worlds, 2)) if body.worlds else body.context
+        context: Any = body.context
+        if body.worlds:
+            context = _belief(context, max(body.worlds, 2))
         imagined = imagine(obj, body.action, context)
         monitor = Monitor(
             imagined,
