@@ -46,8 +46,8 @@ def simulate(
             and direction. Objects and commanded contacts stay the same.
         vary_action: Draw insertion, arc and speed of the blade anew for every lever-up, or the distance of every push.
         exact_share: Share of the lever-ups whose contact is as commanded, with --randomise.
-        active: Simulate only this many of the lever-ups: a hundred at random, then those that differ most from what
-            was simulated, in what their motions depend on.
+        active: Active learning: simulate only this many of the lever-ups, a hundred at random, then a diverse
+            selection.
         off_centre: Move the centre of mass of half the prisms and boxes away from the middle.
         workers: Number of processes; by default one for each core.
         cluster: Address of a Ray cluster that does the work: HOST:PORT, ray://HOST:PORT, or local:N. All nodes must

@@ -41,7 +41,7 @@ SUMMARIES = {
     "novel-families": "Families of objects that are new to the predictor.",
     "other-world": "Few lever-ups of another world, alone or over a twin.",
     "identified-world": "What lever-ups in another world tell for its other objects.",
-    "active": "Lever-ups that are chosen to learn from, beside random ones.",
+    "active": "Active learning: selected lever-ups beside random ones.",
     "non-flat": "Masks against height maps of objects that are not flat.",
     "planning": "Plans beside simple rules and an oracle that simulates all.",
     "sequences": "Goals by several actions, planned again or blind.",

@@ -1,4 +1,4 @@
-"""How many chosen lever-ups teach as much as random ones?
+"""Active learning: how many selected lever-ups are worth as much as random ones?
 
 The pool is a data set without the objects of the test part, so that choosing a lever-up and simulating it are the same.
 All methods begin with the same hundred random lever-ups and double what they have: by lever-ups at random, by those
@@ -45,9 +45,9 @@ METHODS = {
 }
 """How the next lever-ups are found, with a colour."""
 WORDS = {
-    "random": "at random",
-    "disagreement": "by disagreement",
-    "chosen": "by difference",
+    "random": "random",
+    "disagreement": "ensemble disagreement",
+    "chosen": "diversity",
 }
 SHOWN = {
     "full_mean": "Error [cm], mean over the full trajectory",
@@ -173,7 +173,7 @@ class Active(Experiment):
         """A table a metric, and the ratios."""
         methods = summary["methods"]
         counts = sorted({int(count) for found in methods.values() for count in found})
-        parts = ["# Lever-ups that are chosen to learn from"]
+        parts = ["# Active learning"]
         for metric, title in SHOWN.items():
             lines = [
                 [
@@ -226,7 +226,7 @@ class Active(Experiment):
         grid(ax, xlabel="lever-ups learned from", ylabel="error on other objects, full trajectory [cm]")
         fig.legend(loc="outside lower center", ncols=3)
         seeds = rows["seed"].nunique()
-        finish(fig, "Lever-ups at random, and chosen", f"means over {seeds} seeds, 95 % intervals")
+        finish(fig, "Active learning", f"means over {seeds} seeds, 95 % intervals")
         return {"active": fig}
 
     # --- what is learned from -----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Which actions to carry out next, so that a predictor learns much from few of them.
+"""Batch active learning: which actions to execute next, so that a predictor learns much from few of them.
 
 Actions are chosen that differ from those learned from, and from each other, in what their motions depend on. How far
 two actions are apart is measured by the predictor: by how much the motion that it expects would change, to first order
