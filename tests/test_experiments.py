@@ -70,7 +70,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     train_predictor(
         Dataset.open(root / "plain"), recipe.predictor, root / "run", recipe.training, progress=False
     )
-    save_checkpoint(root / "untrained", QUICK["lstm"].change(features="none").make(60))
+    for name, state in (("untrained", "position"), ("poses", "pose")):
+        save_checkpoint(root / name, QUICK["lstm"].change(features="none", state=state).make(60))
     return root
 
 
@@ -107,7 +108,8 @@ CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "pushes": lambda root: dict(zip(("pushes", "shapes"), factories.write_push_table(root, 90), strict=True))
                            | {"methods": ("nearest", "simulation", "learned")},
     "sequences": lambda root: {"pushed": 1, "levered": 0, "few": 2},
-    "planning": lambda root: {"objects": 1, "families": ("polygon",), "worlds": ("nominal",), "contacts": 16},
+    "planning": lambda root: {"objects": 1, "families": ("polygon",), "worlds": ("nominal",), "contacts": 16,
+                              "baseline": root / "poses"},
     "uncertainty": lambda root: {"data": root / "plain", "seeds": (0,), "splits": ("shuffled",), "samples": 3,
                                  "recipe": QUICK["one-shot"]},
 }  # fmt: skip

@@ -8,9 +8,11 @@ import pytest
 import foretrace as ft
 from foretrace.errors import ResultsError
 from foretrace.experiments import planning
-from foretrace.experiments.planning import BELIEVED, FAMILIES, Planning, PlanningTrial
+from foretrace.experiments.planning import BELIEVED, FAMILIES, Planning, PlanningTrial, without_outcomes
 from foretrace.interactions.recording_folder import write_image
 from foretrace.interactions.topdown import TopDownView
+from foretrace.planning import PlanConfig, goals
+from foretrace.predictor import LstmConfig, save_checkpoint
 
 
 def test_one_lever_up_in_the_other_world_is_learned_from(monkeypatch: pytest.MonkeyPatch):
@@ -42,3 +44,26 @@ def test_silhouettes_are_a_family_where_there_are_pictures_of_them(tmp_path):
     assert 0.9 < case.obj.corners.max() / -case.obj.corners.min() < 1.1, "the disc"
     with pytest.raises(ResultsError, match="needs pictures: give their folder with --silhouettes"):
         replace(none, families=("silhouette",)).trials()
+
+
+def test_a_predictor_of_motions_alone_plans_for_every_goal(tmp_path):
+    poses, positions = tmp_path / "poses", tmp_path / "positions"
+    save_checkpoint(poses, LstmConfig(features="none", state="pose", hidden=8).make(60))
+    save_checkpoint(positions, LstmConfig(features="none", hidden=8).make(60))
+    experiment = Planning(objects=1, contacts=16, baseline=poses)
+    case = experiment._draw(PlanningTrial("box", 0), np.random.default_rng(0))
+    quick = PlanConfig(0.02, directions=1, refine=0, check=0)
+    for goal in case.goals.values():
+        made = ft.plan(case.scene.view, without_outcomes(goal), experiment._im_cnn, config=quick)
+        assert np.isfinite(made.cost)
+    assert experiment.identity() != replace(experiment, baseline=None).identity()
+    with pytest.raises(ResultsError, match="predicts positions alone: train it with --state pose"):
+        replace(experiment, baseline=positions).trials()
+
+
+def test_goals_lose_only_what_needs_outcomes():
+    case = Planning(objects=1)._draw(PlanningTrial("box", 0), np.random.default_rng(0))
+    given = {name: without_outcomes(goal) for name, goal in case.goals.items()}
+    assert given["move"] is case.goals["move"]
+    assert given["tilt"] == goals.Tilt(0.5, max_slip=None)
+    assert "tumbled" not in given["turn-over"].needed_outcomes()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -45,6 +45,9 @@ from foretrace.simulation.lever_up import SimulationConfig, simulate_lever_up
 from foretrace.simulation.randomisation import RANDOMISED
 from foretrace.simulation.recipes import ROUND
 from foretrace.twin import TwinConfig, TwinImaginer
+
+if TYPE_CHECKING:
+    from foretrace.predictor.base import EffectPredictor
 
 SILHOUETTE = "silhouette"
 FAMILIES = ("polygon", "outline", "box", SILHOUETTE)
@@ -84,6 +87,8 @@ class Planning(Experiment):
     """Which truths."""
     contacts: int = 40
     """Contacts around an outline."""
+    baseline: Path | None = None
+    """Folder of a training of im-cnn with an LSTM (`--state pose`), with which the planner is run, too."""
     seed: int = 0
     """Decides objects, views, goals and physics."""
 
@@ -106,6 +111,8 @@ class Planning(Experiment):
             )
         some = FAMILIES if self.silhouettes is not None else FAMILIES[:-1]
         families = chosen("family", self.families, some)
+        if self.baseline is not None and self._im_cnn.state != "pose":
+            raise ResultsError(f"{self.baseline} predicts positions alone: train it with --state pose")
         return [PlanningTrial(family, number) for number in range(self.objects) for family in families]
 
     def identity(self) -> dict[str, Any] | None:
@@ -117,6 +124,7 @@ class Planning(Experiment):
             "contacts": self.contacts,
             "worlds": list(self.worlds),
             "predictor": short_hash([(default_checkpoint() / MODEL).read_bytes()]),
+            "baseline": short_hash([(self.baseline / MODEL).read_bytes()]) if self.baseline else None,
         }
 
     def run(self, trial: PlanningTrial, folder: Path) -> Sequence[Row]:
@@ -194,9 +202,12 @@ class Planning(Experiment):
                 "identified": (self._learned, None, whole, learned),
                 "identified, checked": (self._learned, self._twin, few, learned),
             }
+        if self.baseline is not None:
+            plans["im-cnn"] = (self._im_cnn, None, whole, {})
         for method, (imaginer, checker, config, told) in plans.items():
+            wanted = without_outcomes(goal) if method == "im-cnn" else goal
             started = perf_counter()
-            made = plan(case.scene.view, goal, imaginer, config=config, checker=checker, **told)
+            made = plan(case.scene.view, wanted, imaginer, config=config, checker=checker, **told)
             seconds = perf_counter() - started
             apart = np.linalg.norm(contacts - made.action.contact, axis=1)
             found[method] = (int(apart.argmin()), seconds)
@@ -244,6 +255,10 @@ class Planning(Experiment):
         return load_predictor()
 
     @cached_property
+    def _im_cnn(self) -> "EffectPredictor":
+        return load_predictor(self.baseline)
+
+    @cached_property
     def _twin(self) -> TwinImaginer:
         return TwinImaginer(config=TwinConfig(workers=1))
 
@@ -259,6 +274,13 @@ class Planning(Experiment):
 def _draw_physics(rng: np.random.Generator) -> Physics:
     ranges = {name: getattr(RANDOMISED, name) for name in ("friction", "tool_friction", "density")}
     return Physics(**{name: float(rng.uniform(*limits)) for name, limits in ranges.items()})
+
+
+def without_outcomes(goal: Goal) -> Goal:
+    """The same goal for an imaginer of motions alone: slips have no limit, and a tumble is what looks like one."""
+    if isinstance(goal, goals.TurnOver):
+        return goals.Own(goal.cost)
+    return replace(goal, max_slip=None) if isinstance(goal, (goals.Lift, goals.Tilt)) else goal
 
 
 @dataclass(eq=False)

@@ -14,7 +14,7 @@ from foretrace.pictures.style import GREY, INK, new_figure, styled
 GOALS = ("lift", "tilt", "move", "move-to", "turn-over")
 """What is wanted: as high as possible without a slip; 0.5 rad; as far as possible in a direction; a place 3 cm away; as
 far as possible over towards a direction."""
-DARK_PURPLE = "#7a3e6c"
+BROWN, DARK_PURPLE = "#8c6d31", "#7a3e6c"
 SAFE = ("lift", "tilt")
 """Goals with a limit to slips."""
 METHODS = {
@@ -22,6 +22,7 @@ METHODS = {
     "longest edge": GREY,
     "far": GREY,
     "closed form": ORANGE,
+    "im-cnn": BROWN,
     "without uncertainty": SKY,
     "learned": BLUE,
     "learned, checked": GREEN,
@@ -36,6 +37,7 @@ WORDS = {
     "longest edge": "middle of the longest edge",
     "far": "farthest from the centre of mass",
     "closed form": "closed-form rule, by the goal",
+    "im-cnn": "planner, im-cnn with an LSTM",
     "without uncertainty": "planner, learned, likeliest future alone",
     "learned": "planner, learned",
     "learned, checked": "planner, learned, best few checked by the twin",
