@@ -438,6 +438,10 @@ def test_what_cannot_be_run_is_refused(tmp_path: Path):
         run_experiment(EXPERIMENTS["paper"](), tmp_path)
     with pytest.raises(ResultsError, match="is a file: give a folder"):
         run_experiment(Toy(), Path(__file__))
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "manifest.json").write_text("{}")
+    with pytest.raises(ResultsError, match="is a data set: give another folder"):
+        run_experiment(Toy(), tmp_path / "data")
     with pytest.raises(ResultsError, match="workers is 0"):
         run_experiment(Toy(), tmp_path / "out", workers=0)
     with pytest.raises(ResultsError, match="threads is 0"):

@@ -134,7 +134,7 @@ def test_other_sample_times_are_refused(initial, further, tmp_path, change):
         name: np.concatenate([values, np.repeat(fill, values.shape[-1], axis=-1)], axis=1)
         for name, values in (("com", further.com), ("pose", further.pose))
     }
-    with pytest.raises(TrainingError, match=r"the data are sampled at .* take data with its period"):
+    with pytest.raises(TrainingError, match=r"sampled every 0\.\S+ s up to \S+ s, .* take data with its"):
         train_predictor(replace(further, times=times, **longer), read(initial), tmp_path / "tuned", MORE)
 
 

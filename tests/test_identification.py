@@ -127,7 +127,8 @@ def test_a_belief_comes_back_from_its_file(tmp_path, learned):
         ({"weights": [-1.0] * 4096}, "no belief"),
         ({"weights": [1e308] * 4096}, "no belief"),
         ({"ranges": {"friction": [0.9, 1.0]}}, "out of its range"),
-        ({"ranges": {"colour": [0.0, 1.0]}}, "colour"),
+        ({"ranges": {"colour": [0.0, 1.0]}}, r"belief\.json: 'colour' is no constant"),
+        ({"worlds": 0}, r"belief\.json: worlds is 0"),
     ],
 )
 def test_a_file_that_holds_no_belief_is_refused(tmp_path, change, words):

@@ -281,7 +281,7 @@ def test_recalibrated_regions_hold_on_the_new_data(card: str, run: Path, tmp_pat
     [
         ("few", "40 interactions have an outcome that the predictor distinguishes: give at least 200"),
         ("own", "the predictor was trained on these data"),
-        ("sampled", "the data are sampled at"),
+        ("sampled", "the data are sampled every"),
         ("lstm", "predictor 'lstm' has no regions to calibrate: take one-shot"),
         ("none", "config.json"),
     ],

@@ -326,6 +326,14 @@ def test_a_diverging_training_is_stopped(tmp_path, batch, monkeypatch):
         train(batch, tmp_path / "run", replace(SMALL, learning_rate=1e30))
 
 
+def test_a_motion_that_is_not_finite_is_named(batch):
+    com = batch.com.copy()
+    com[3, 5] = np.nan
+    rows = np.arange(len(batch))
+    with pytest.raises(TrainingError, match="interaction 3 has a motion that is not finite, as have 1 of"):
+        fit_predictor(replace(batch, com=com), CONFIG, Split(rows, rows, rows), SMALL)
+
+
 def test_only_the_chosen_outcomes_are_split(tmp_path, batch):
     run = train(batch, tmp_path / "run", replace(SMALL, epochs=1))
     parts = [part_of(run, batch, name) for name in ("train", "validation", "test")]

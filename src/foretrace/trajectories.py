@@ -158,5 +158,16 @@ def interpolate_poses(
     return poses
 
 
+def rhythm(times: Float[np.ndarray, " time"]) -> str:
+    """Sample times [s] in words: their period, and the last of them."""
+    periods = np.unique(np.round(np.diff(times), 6))
+    every = (
+        " to ".join(f"{period:g}" for period in dict.fromkeys((periods[0], periods[-1])))
+        if len(periods)
+        else "0"
+    )
+    return f"every {every} s up to {times[-1]:g} s"
+
+
 def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.asarray(a, dtype=float) - np.asarray(b, dtype=float), axis=-1)

@@ -25,6 +25,7 @@ from foretrace.errors import ForetraceError, ResultsError, shown
 from foretrace.evaluation.experiment import Experiment, Row, Trial, checked_seeds
 from foretrace.evaluation.storage import Rows, Store, kept_identity, table_of
 from foretrace.files import as_json, versions_of
+from foretrace.interactions.storage import MANIFEST
 from foretrace.predictor.run_folder import git_commit
 from foretrace.workers import ProgressReport, count_workers, run_jobs, uses_cluster
 
@@ -114,6 +115,8 @@ def _trials_of(experiment: Experiment) -> list[Trial]:
 def _store(experiment: Experiment, out: Path, redraw: bool = False) -> Store:
     if out.exists() and not out.is_dir():
         raise ResultsError(f"{out} is a file: give a folder to write to")
+    if (out / MANIFEST).exists():
+        raise ResultsError(f"{out} is a data set: give another folder for the results")
     identity = None if redraw else experiment.identity()
     if identity is None:
         return Store(out, experiment, kept_identity(out, experiment.label))

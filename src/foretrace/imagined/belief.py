@@ -241,7 +241,10 @@ class Belief:
         """
         file = as_path(path, PredictionError)
         found = read_versioned(file, BeliefEntries, FORMAT, VERSION, PredictionError, REMEDY, key="version")
-        prior = cls(found["ranges"], worlds=found["worlds"])
+        try:
+            prior = cls(found["ranges"], worlds=found["worlds"])
+        except PredictionError as error:
+            raise PredictionError(f"{file}: {error}") from None
         weights = np.array(found["weights"])
         if (
             set(found["values"]) != set(prior.names)

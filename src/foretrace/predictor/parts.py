@@ -71,15 +71,25 @@ def prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = 
         source: Its interactions.
         predictor: The predictor.
         inputs: Inputs of its features, where they are known already.
+
+    Raises:
+        TrainingError: An observed motion is not finite.
     """
     if isinstance(source, Dataset):
         return _prepare_in_pieces(source, predictor)
     inputs = predictor.features.inputs(source) if inputs is None else inputs
+    states = predictor.encode(source)
+    wrong = np.flatnonzero(~np.isfinite(states).all(axis=(1, 2)))
+    if len(wrong):
+        raise TrainingError(
+            f"interaction {source.ids[wrong[0]]} has a motion that is not finite, as have {len(wrong)} of "
+            f"{len(source)}: leave them out"
+        )
     return Part(
         source=source,
         inputs=inputs,
         context=recorded_context(source, predictor.context, predictor.marginal),
-        states=predictor.encode(source),
+        states=states,
         lengths=predictor.lengths(source),
         outcomes=predictor.number_outcomes(source),
         estimated_com=_estimated_com(source),

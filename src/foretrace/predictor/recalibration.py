@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from foretrace.errors import TrainingError, check_type, shown
+from foretrace.errors import TrainingError, check_type
 from foretrace.files import as_path, write_json
 from foretrace.imagined import STARTS, conformal_scores
 from foretrace.interactions.dataset import Dataset
 from foretrace.predictor.checkpoint import CALIBRATION, CONFIG, read_config, read_predictor, write_tensors
 from foretrace.predictor.parts import effects_of, features_of, outcome_of, prepare, usable_lengths
 from foretrace.predictor.run_folder import MODEL, RunFolder, fingerprint
+from foretrace.trajectories import rhythm
 
 FEWEST = 200
 """Fewer interactions say little about a 95 % region."""
@@ -56,8 +57,8 @@ def recalibrate(run: str | Path, data: Dataset) -> dict[str, list[float]]:
     chosen = data[np.flatnonzero(usable)].batch()
     if not np.array_equal(np.round(chosen.times, 9), np.round(predictor.sample_times, 9)):
         raise TrainingError(
-            f"the data are sampled at {shown(chosen.times.tolist())}, the predictor imagines "
-            f"{shown(predictor.sample_times.tolist())}: simulate with the same --sample-period and --watch-time"
+            f"the data are sampled {rhythm(chosen.times)}, the predictor imagines motions "
+            f"{rhythm(predictor.sample_times)}: simulate with the same --sample-period and --watch-time"
         )
     part = prepare(chosen, predictor)
     uniform = np.isfinite(part.estimated_com).all(axis=1)

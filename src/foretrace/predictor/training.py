@@ -47,7 +47,7 @@ from foretrace.predictor.run_folder import (
 )
 from foretrace.predictor.runtime import find_device, seeded, suitable_threads, thread_count
 from foretrace.predictor.states import state_statistics
-from foretrace.trajectories import final_distance, mean_distance
+from foretrace.trajectories import final_distance, mean_distance, rhythm
 
 RUNTIME = ("device", "threads", "precision")
 """Settings that say where a training runs, not what it ends with."""
@@ -423,6 +423,6 @@ def _check_times(predictor: EffectPredictor, source: Source) -> None:
     times, own = np.round(source.times, 9), np.round(predictor.sample_times, 9)
     if not np.array_equal(times, own[: len(times)]):
         raise TrainingError(
-            f"the data are sampled at {shown(times.tolist())}, the predictor imagines {shown(own.tolist())}: take data "
-            f"with its period, and for at most {own[-1]:g} s"
+            f"the data are sampled {rhythm(times)}, the predictor imagines motions {rhythm(own)}: take data with its "
+            f"period, and for at most {own[-1]:g} s"
         )
