@@ -217,6 +217,7 @@ def kills(options: Options) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     log, end = folder / "kills.jsonl", time.monotonic() + 60 * options.minutes
     rows = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
+    done = {row["kill"] for row in rows}
     cluster = Loopback(folder)
     try:
         reference = folder / "reference"
@@ -229,8 +230,10 @@ def kills(options: Options) -> int:
         assert command(cluster, timed, cluster.address).wait(LIMIT) == 0
         seconds = time.monotonic() - begun
         assert contents(timed) == wanted
-        while len(rows) < options.kills and time.monotonic() < end:
-            row = one_kill(cluster, len(rows), options.seed, seconds, wanted, folder)
+        for number in sorted(set(range(options.kills)) - done):
+            if time.monotonic() > end:
+                break
+            row = one_kill(cluster, number, options.seed, seconds, wanted, folder)
             print(row, flush=True)
             rows.append(row)
             with open(log, "a") as file:
@@ -239,6 +242,7 @@ def kills(options: Options) -> int:
         for node in ("node", "head"):
             cluster.kill(node)
         shutil.rmtree(f"/tmp/ray-{cluster.name}", ignore_errors=True)
+    rows.sort(key=lambda row: row["kill"])
     faults = [row for row in rows if "fault" in row]
     write_json(
         options.out / "kills.json", {"seed": options.seed, "seconds": round(seconds, 1), "kills": rows}
