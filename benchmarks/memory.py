@@ -20,6 +20,17 @@ from foretrace.interactions import shards, storage
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
+WATCH = """
+import re, threading, time
+peak = 0
+def watch():
+    global peak
+    while True:
+        status = open("/proc/self/status").read()
+        peak = max(peak, int(re.search(r"RssAnon:\\s+(\\d+)", status)[1]))
+        time.sleep(0.02)
+threading.Thread(target=watch, daemon=True).start()
+"""
 DESCRIBE = """
 from foretrace.interactions.description import describe_dataset
 describe_dataset(Dataset.open({path!r}))
@@ -59,11 +70,11 @@ def main(options: Options) -> None:
 
 
 def peak_of(code: str) -> float:
-    """Peak memory of a Python process [MB]."""
-    told = "\nimport resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
-    done = subprocess.run([sys.executable, "-c", code + told], capture_output=True, text=True, check=True)
-    scale = 1024 if sys.platform == "linux" else 1024**2
-    return int(done.stdout.splitlines()[-1]) / scale
+    """Peak memory of a Python process [MB]; pages of mapped files are not counted, which the system may take back."""
+    done = subprocess.run(
+        [sys.executable, "-c", WATCH + code + "\nprint(peak)"], capture_output=True, text=True, check=True
+    )
+    return int(done.stdout.splitlines()[-1]) / 1024
 
 
 def repeat(few: Path, out: Path, number: int) -> None:

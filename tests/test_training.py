@@ -515,6 +515,10 @@ def test_data_sets_larger_than_memory_train_the_same(tmp_path, monkeypatch, conf
     assert part_of(pieces, data).ids.tolist() == part_of(whole, data.batch()).ids.tolist()
     monkeypatch.setattr(parts, "LARGE", 0)
     single = train(data, tmp_path / "single", config=config)
+    assert {file.name for file in single.iterdir()} == {file.name for file in whole.iterdir()}
+    monkeypatch.setattr(parts, "FEW_BYTES", 10**9)  # in memory, not in files of the folder
+    memory = train(data, tmp_path / "memory", config=config)
+    assert (memory / "model.safetensors").read_bytes() == (single / "model.safetensors").read_bytes()
     losses = [[float(row["train_loss"]) for row in rows(run)] for run in (whole, single)]
     np.testing.assert_allclose(*losses, rtol=1e-3)
     assert (single / "model.safetensors").read_bytes() != (whole / "model.safetensors").read_bytes()

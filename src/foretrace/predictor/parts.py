@@ -1,6 +1,9 @@
 """Parts of the data, ready to learn from."""
 
+import os
+import tempfile
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,6 +23,9 @@ from foretrace.predictor.states import Effects, valid_lengths
 
 LARGE = 20_000
 """States of a part of more interactions are kept in single precision, and features take the place of their inputs."""
+
+FEW_BYTES = 64
+"""Of a large part, values of a row that take more may be kept in a file."""
 
 PIECE = 2048
 """Rows that are normalised together."""
@@ -64,19 +70,22 @@ class Part:
         return np.arange(self.states.shape[1]) < self.lengths[:, None]
 
 
-def prepare(source: Source, predictor: EffectPredictor, inputs: Tensor | None = None) -> Part:
+def prepare(
+    source: Source, predictor: EffectPredictor, inputs: Tensor | None = None, folder: Path | None = None
+) -> Part:
     """A part of the data for a predictor; of a `Dataset` piece by piece, since it need not fit into memory.
 
     Args:
         source: Its interactions.
         predictor: The predictor.
         inputs: Inputs of its features, where they are known already.
+        folder: Where a large part of a `Dataset` is kept in files that go with it; in memory if not given.
 
     Raises:
         TrainingError: An observed motion is not finite.
     """
     if isinstance(source, Dataset):
-        return _prepare_in_pieces(source, predictor)
+        return _prepare_in_pieces(source, predictor, folder)
     inputs = predictor.features.inputs(source) if inputs is None else inputs
     states = predictor.encode(source)
     wrong = np.flatnonzero(~np.isfinite(states).all(axis=(1, 2)))
@@ -134,7 +143,8 @@ def _estimated_com(source: InteractionBatch) -> np.ndarray:
     return np.where(uniform[:, None], estimate_com(source), np.nan)
 
 
-def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
+def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor, folder: Path | None) -> Part:
+    large = len(source) > LARGE
     columns: dict[str, np.ndarray] = {}
     measures: dict[str, np.ndarray] = {}
     order, done = np.argsort(source.ids, kind="stable"), 0  # as they lie on disk: each shard is read once
@@ -143,7 +153,7 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
         own = {
             "inputs": piece.inputs.numpy(),
             "context": piece.context,
-            "states": piece.states.astype(np.float32 if len(source) > LARGE else np.float64),
+            "states": piece.states.astype(np.float32 if large else np.float64),
             "lengths": piece.lengths,
             "outcomes": piece.outcomes,
             "estimated_com": piece.estimated_com,
@@ -151,11 +161,23 @@ def _prepare_in_pieces(source: Dataset, predictor: EffectPredictor) -> Part:
         }
         for whole, found in ((columns, own), (measures, piece.measures)):
             for name, values in found.items():
-                column = whole.setdefault(name, np.empty((len(source), *values.shape[1:]), values.dtype))
-                column[order[done : done + len(batch)]] = values
+                if name not in whole:
+                    kept = folder if large and values[0].nbytes > FEW_BYTES else None
+                    whole[name] = _room((len(source), *values.shape[1:]), values.dtype, kept)
+                whole[name][order[done : done + len(batch)]] = values
         done += len(batch)
     inputs = torch.from_numpy(columns.pop("inputs"))
     return Part(source, inputs, measures=measures, **columns)
+
+
+def _room(shape: tuple[int, ...], dtype: np.dtype, folder: Path | None) -> np.ndarray:
+    """An array without values: in memory, or mapped from a file that has no name and goes with it."""
+    if folder is None:
+        return np.empty(shape, dtype)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        if hasattr(os, "posix_fallocate"):  # on a full disk an error now, no dead process later
+            os.posix_fallocate(file.fileno(), 0, int(np.prod(shape)) * dtype.itemsize)
+        return np.memmap(file, dtype, "w+", shape=shape)
 
 
 def choose_split(source: Source, training: TrainConfig) -> Split:

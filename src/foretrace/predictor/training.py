@@ -187,7 +187,9 @@ def _train_into(
         {"seed": training.seed, "data": data, "device": str(predictor.device)}
         | {"precision": predictor.features.precision, "threads": torch.get_num_threads()}
     )
-    train, validation = (prepare(source[rows], predictor) for rows in (split.train, split.validation))
+    train, validation = (
+        prepare(source[rows], predictor, folder=folder.path) for rows in (split.train, split.validation)
+    )
     with (
         terminal(training.num_epochs(len(split.train)), progress) as (report, show),
         tensorboard(folder.path / TENSORBOARD) as log,
