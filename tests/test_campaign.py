@@ -15,7 +15,7 @@ from campaign.materials import prepare
 from campaign.server import Server
 
 PARTS = [(kind, number) for kind in ("input", "call") for number in range(4)]
-EXAMPLES = 250
+EXAMPLES = 150
 """Of each part."""
 FEW, COSTLY = 2, 1
 """Crash points tried of a command, and of one that takes longer."""

@@ -67,7 +67,7 @@ def test_workers_that_wait_for_room_in_a_pipe_end_with_their_parent():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", range(6))
+@pytest.mark.parametrize("moment", range(3))
 def test_a_killed_simulation_leaves_no_process(tmp_path, moment):
     fast = ["--embodiment", "tool", "--insert-time", "0.1", "--lift-time", "0.2", "--hold-time", "0"]
     process = start(["-m", "foretrace", "simulate", "--out", str(tmp_path / "data"), *fast, "--workers", "2"])
