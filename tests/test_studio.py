@@ -254,7 +254,9 @@ def test_a_monitor_watches_what_goes_wrong(wish):
 
 
 def test_three_lever_ups_narrow_what_is_believed():
-    truth, beliefs = Session(seed=2).learn()
+    told = []
+    truth, beliefs = Session(seed=2).learn(lambda truth, beliefs: told.append(learned_html(truth, beliefs)))
+    assert [f"lever-up {k} of 3" in html for k, html in enumerate(told, 1)] == [True] * 3
     assert set(truth) == {"friction", "tool_friction", "density"}
     prior, last = ft.Belief(), beliefs[-1]
     assert len(beliefs) == 3
@@ -262,6 +264,7 @@ def test_three_lever_ups_narrow_what_is_believed():
     assert abs(last.mean["tool_friction"] - truth["tool_friction"]) < 3 * last.std["tool_friction"]
     shown = learned_html(truth, beliefs)
     assert "after 3" in shown
+    assert "lever-up" not in shown
     assert shown.count("±") == 12
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from foretrace.actions import LeverUp
 from foretrace.errors import ForetraceError, StudioError
+from foretrace.imagined import Belief
 from foretrace.interactions.dataset import Dataset
 from foretrace.interactions.record import Interaction
 from foretrace.perception.photo import PhotoView
@@ -255,7 +256,10 @@ class Page:
         self._told = -1
 
     def _learn(self) -> None:
-        self.controls.learned.content = learned_html(*self.session.learn())
+        def tell(truth: dict[str, float], beliefs: list[Belief]) -> None:
+            self.controls.learned.content = learned_html(truth, beliefs)
+
+        tell(*self.session.learn(tell))
 
     def _save(self, name: str, make: Callable[[], bytes]) -> None:
         self._client.send_file_download(name, make())

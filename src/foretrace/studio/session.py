@@ -223,8 +223,13 @@ class Session:
         self.watched = watch_again(interaction, self._once("believed", self._believe))
         return self.watched
 
-    def learn(self) -> tuple[dict[str, float], list[Belief]]:
+    def learn(
+        self, tell: Callable[[dict[str, float], list[Belief]], None] = lambda drawn, beliefs: None
+    ) -> tuple[dict[str, float], list[Belief]]:
         """Three lever-ups around the object in one world, simulated, and what each of them tells of its constants.
+
+        Args:
+            tell: Is told the world's constants and what is believed so far, before each lever-up.
 
         Returns:
             The world's constants, all of them drawn, and what is believed after each lever-up.
@@ -238,6 +243,7 @@ class Session:
         config = SimulationConfig(embodiment="tool", physics=physics)
         beliefs: list[Belief] = []
         for number in range(LEVER_UPS):
+            tell(drawn, beliefs)
             unknown.change(along=(self.choices.along + number / LEVER_UPS) % 1.0)
             action, obj = unknown.action, self.choices.object
             effect = simulate_lever_up(obj, action, config).effect

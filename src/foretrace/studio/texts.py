@@ -8,7 +8,7 @@ import numpy as np
 from foretrace.imagined import Belief, ImaginedEffect
 from foretrace.pictures.style import GREY, OUTCOME_COLORS, PREDICTION_COLORS
 from foretrace.planning import Plan
-from foretrace.studio.session import LEVEL, Simulated
+from foretrace.studio.session import LEVEL, LEVER_UPS, Simulated
 from foretrace.studio.watching import Watched
 
 LEAST_SHOWN = 5e-4
@@ -60,7 +60,7 @@ def result_html(imagined: ImaginedEffect | None, message: str = "") -> str:
 
 
 def learned_html(truth: Mapping[str, float], beliefs: Sequence[Belief]) -> str:
-    """What is believed of each constant before and after lever-ups, and what it is, in HTML."""
+    """What is believed of each constant before and after lever-ups, and what it is, in HTML; which one is next."""
     before = Belief()
     heads = ["", "before", *(f"after {k}" for k in range(1, len(beliefs) + 1)), "truth"]
     rows = [
@@ -75,7 +75,8 @@ def learned_html(truth: Mapping[str, float], beliefs: Sequence[Belief]) -> str:
         "".join(f"<td style='padding:0 0.35em'>{escape(cell)}</td>" for cell in row) for row in (heads, *rows)
     ]
     lines = "".join(f"<tr>{each}</tr>" for each in cells)
-    return f'<table style="font-size:0.75em;line-height:1.6;margin:0.4em">{lines}</table>'
+    left = "" if len(beliefs) == LEVER_UPS else _note(f"lever-up {len(beliefs) + 1} of {LEVER_UPS} …")
+    return f'<table style="font-size:0.75em;line-height:1.6;margin:0.4em">{lines}</table>{left}'
 
 
 def _note(text: str) -> str:
