@@ -32,7 +32,7 @@ class Lift(Goal):
     label = "lift"
     outcomes = (LEVERED,)
     max_slip: float | None = 0.05
-    """Largest probability of a slip; None: any."""
+    """Largest accepted probability that the object slips off the blade, 0 to 1; None: any."""
     at_least: float = 0.01
     """Rise from which on the goal counts as reached [m]."""
 
@@ -64,7 +64,7 @@ class Tilt(Goal):
     tolerance: float = 0.09
     """Deviation up to which the goal counts as reached [rad]."""
     max_slip: float | None = 0.05
-    """Largest probability of a slip; None: any."""
+    """Largest accepted probability that the object slips off the blade, 0 to 1; None: any."""
 
     def __post_init__(self) -> None:
         check_angle("angle", self.angle, 0.0, np.pi)

@@ -39,7 +39,7 @@ class Move(Goal):
     direction: Any
     """The direction, (x, y) in the object's frame; its length does not matter."""
     max_slip: float | None = None
-    """Largest probability of a slip; None: any."""
+    """Largest accepted probability that the object slips off the blade, 0 to 1; None: any."""
     at_least: float = 0.01
     """Distance from which on the goal counts as reached [m]."""
 
