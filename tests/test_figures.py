@@ -57,6 +57,9 @@ def test_interaction_figure_shows_truth_and_predictions_in_cm(interaction):
     for wanted in ("x, along the action [cm]", "y, to the left [cm]", "z, up [cm]", "time [s]", "slip"):
         assert any(wanted in text for text in shown), wanted
     assert "Interaction 4: 7 corners, slipped" in shown
+    assert "centre of mass, simulated" in shown
+    recorded = replace(interaction, provenance=replace(interaction.provenance, source="recorded"))
+    assert "centre of mass, observed" in texts(interaction_figure(recorded))
     assert any("im-cnn (mean error 0.50 cm, at the end 0.50 cm)" in text for text in shown)
     assert any("none (mean error 0.00 cm" in text for text in shown)
     from_above, truth = paths_drawn(fig, 0, TRUTH_COLOR), com[:, [1, 0]] * 100

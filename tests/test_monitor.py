@@ -19,7 +19,7 @@ from foretrace.monitoring import Drift, MonitorCalibration, Verdict
 from foretrace.monitoring.causes import BAD_INPUT, FROZEN, LOST, CauseModel
 from foretrace.monitoring.motions import motions_of, place_of
 from foretrace.pictures.scene import Scene
-from foretrace.pictures.watched import MOST, _evenly, monitor_film
+from foretrace.pictures.watched import MOST, _evenly, monitor_figure, monitor_film
 from foretrace.simulation.collect import CollectConfig, collect
 from foretrace.simulation.lever_up import SimulationConfig
 
@@ -426,6 +426,20 @@ def test_a_film_says_so_from_the_alarm_on(tmp_path):
     assert (given[0] == given[first - 1]).all()
     assert (given[first] == given[-1]).all()
     assert (given[first] != given[first - 1]).any()
+
+
+def test_the_picture_marks_when_another_outcome_takes_over():
+    verdict = Verdict(0.0, False, None, 0.5, 3.0, False, {"levered": 1.0, "slipped": 0.0}, {}, "")
+    slipped = replace(verdict, transition=True, outcomes={"levered": 0.2, "slipped": 0.8})
+    verdicts = [replace(slipped if t >= 0.5 else verdict, time=float(t)) for t in TIMES]
+    imagined = ft.load_predictor().imagine(ft.TopDownView.of(PRISM, ACTION), ACTION)
+    com = np.tile(COM, (len(TIMES), 1))
+    figure = monitor_figure(imagined, verdicts, com, "a slip", "simulated")
+    marks = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert marks == ["0.50 s: slipped takes over"]
+    legend = figure.axes[2].get_legend()
+    assert legend is not None
+    assert "simulated" in [text.get_text() for text in legend.get_texts()]
 
 
 def test_a_film_runs_in_real_time_however_often_the_object_was_tracked():

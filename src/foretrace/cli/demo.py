@@ -4,7 +4,7 @@ import time
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from foretrace.cli.console import print_report
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from foretrace.actions import LeverUp
     from foretrace.interactions.record import Effect, Interaction
     from foretrace.interactions.topdown import TopDownView
+    from foretrace.monitoring import Verdict
     from foretrace.objects import Prism
     from foretrace.pictures.scene import Scene
     from foretrace.predictor import EffectPredictor
@@ -35,7 +36,9 @@ PAGE = """\
 <style>
 body {{ margin: 2rem auto; max-width: 70rem; padding: 0 1rem; font-family: sans-serif; color: #22262e }}
 figure {{ margin: 0 0 3rem }}
-figcaption {{ font-weight: bold; margin-bottom: 0.7rem }}
+h2 {{ font-size: 1rem; margin: 0 }}
+figcaption {{ margin-bottom: 0.7rem; max-width: 48rem; line-height: 1.4 }}
+figcaption p {{ margin: 0.3rem 0 0 }}
 img {{ max-width: 100%; height: auto }}
 </style>
 <h1>foretrace</h1>
@@ -92,7 +95,14 @@ def demo(
     print("   " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     dataset = Dataset.open(out / "data")
     contact_sheet(dataset).savefig(out / "interactions.png")
-    pictures.append(("interactions.png", "Some of the simulated lever-ups"))
+    pictures.append(
+        Picture(
+            "interactions.png",
+            "Some of the simulated lever-ups",
+            "Each from above. The arrow is the push of the screwdriver, the line the path of the centre of mass. "
+            "Support points are the two points on the table about which the object turns.",
+        )
+    )
 
     # One thread: two on a core that something else uses would be many times slower.
     config = TrainConfig(epochs=epochs, min_steps=min_steps, split=None, seed=seed, threads=1)
@@ -117,17 +127,32 @@ def demo(
         print_report(run_experiment(Predictor(run, out / "data"), console=Console(quiet=True)).report)
     scenes = {title: _scene(predictors, title, *interaction) for title, interaction in shown.items()}
     comparison_figure(scenes).savefig(out / "predictions.png")
-    pictures.append(("predictions.png", "Three predictors that learned from these lever-ups alone"))
+    pictures.append(
+        Picture(
+            "predictions.png",
+            "Three predictors that learned from these lever-ups alone",
+            "Without a feature a network is not shown the object; Im-CNN sees it from above. Both predict one moment "
+            "after the other. One-shot sees it too, and predicts the whole motion at once. Numbers are mean distances "
+            "of the predicted centre of mass from the simulated one.",
+        )
+    )
     page = write_page(out, pictures)
     print(f"Done in {time.monotonic() - started:.0f} s. All pictures are on one page:")
     print(page)
 
 
-Pictures = list[tuple[str, str]]
-"""Files of a folder, each with what it shows."""
+class Picture(NamedTuple):
+    """A picture of the page."""
+
+    file: str
+    """Its name in the folder."""
+    title: str
+    """What it shows, in a line."""
+    about: str
+    """What its words and lines mean."""
 
 
-def _show_shipped(out: Path, shown: "dict[str, tuple[Interaction, TopDownView]]") -> Pictures:
+def _show_shipped(out: Path, shown: "dict[str, tuple[Interaction, TopDownView]]") -> list[Picture]:
     """The shipped predictor and the twin beside what is simulated."""
     from foretrace.pictures.animation import scene_animation
     from foretrace.pictures.prediction import scene_of
@@ -145,12 +170,23 @@ def _show_shipped(out: Path, shown: "dict[str, tuple[Interaction, TopDownView]]"
     comparison_figure(scenes).savefig(out / "shipped.png")
     scene_animation(scenes["New shape, 6 corners"], out / "prediction.gif")
     return [
-        ("prediction.gif", "Predicted before the touch (orange) and simulated: path, object and 90 % region"),
-        ("shipped.png", "Predictor and twin beside the simulation, from above and from the side"),
+        Picture(
+            "prediction.gif",
+            "Predicted before the touch (orange) and simulated (green)",
+            "Lines are paths of the centre of mass, the orange edges the object as predicted. The translucent region "
+            "is meant to hold the path with a probability of 90 %.",
+        ),
+        Picture(
+            "shipped.png",
+            "Predictor and twin beside the simulation, from above and from the side",
+            "The predictor has learned from many lever-ups. The twin has learned nothing: it simulates the lever-up on "
+            "the object that is seen. Support points are the two points on the table about which the object turns. "
+            "Numbers are mean distances of the predicted centre of mass from the simulated one.",
+        ),
     ]
 
 
-def _show_plans(out: Path, seed: int) -> Pictures:
+def _show_plans(out: Path, seed: int) -> list[Picture]:
     """Where to lever for two goals."""
     import numpy as np
 
@@ -159,7 +195,7 @@ def _show_plans(out: Path, seed: int) -> Pictures:
     from foretrace.planning import goals, plan
 
     prism = sample_prism(np.random.default_rng([seed, 2]), 6)
-    pictures: Pictures = []
+    pictures: list[Picture] = []
     for name, goal, what in (
         ("plan-lift.png", goals.Lift(max_slip=0.05), "Where to lever so that it rises as far as possible"),
         ("plan-move.png", goals.Move((1.0, 0.0)), "Where to lever so that it moves to the right"),
@@ -167,16 +203,20 @@ def _show_plans(out: Path, seed: int) -> Pictures:
         found = plan(prism, goal)
         plan_figure(found).savefig(out / name)
         print(f"   {found.goal}: reached with a probability of {found.reached:.0%}")
-        pictures.append((name, what))
+        about = (
+            "Dots are contacts around the rim: the lighter, the lower the cost, and the better the goal is reached. "
+            "The arrow is the chosen contact; on the right is what is predicted of it."
+        )
+        pictures.append(Picture(name, what, about))
     return pictures
 
 
-def _show_slip(out: Path, seed: int) -> Pictures:
+def _show_slip(out: Path, seed: int) -> list[Picture]:
     """A monitor watches an object slip that was to be levered: the blade is pushed in less far than commanded."""
     from foretrace.imagined import Belief
     from foretrace.interactions.topdown import TopDownView
     from foretrace.monitoring import Monitor
-    from foretrace.pictures.watched import monitor_figure
+    from foretrace.pictures.watched import monitor_figure, turning_point
     from foretrace.predictor import load_imaginer
 
     prism, action, effect = _slip(seed)
@@ -186,10 +226,34 @@ def _show_slip(out: Path, seed: int) -> Pictures:
         monitor.update(float(t), pose) for t, pose in zip(effect.times, effect.pose_trajectory, strict=True)
     ]
     title = f"To be levered; {effect.outcome}"
-    monitor_figure(imagined, verdicts, effect.com_trajectory, title).savefig(out / "monitor.png")
-    sure = next((each for each in verdicts if each.outcomes.get(effect.outcome, 0.0) > 0.5), None)
+    monitor_figure(imagined, verdicts, effect.com_trajectory, title, "simulated").savefig(out / "monitor.png")
+    alarm = next((each for each in verdicts if each.alarm), None)
+    sure = turning_point(verdicts)
     print("   not noticed" if sure is None else f"   the monitor knows at {sure.time:.2f} s that it slips")
-    return [("monitor.png", "Watched by a monitor: an object that was to be levered slips")]
+    title = "Watched by a monitor: an object that was to be levered slips"
+    return [Picture("monitor.png", title, _about_slip(effect, sure, alarm))]
+
+
+def _about_slip(effect: "Effect", sure: "Verdict | None", alarm: "Verdict | None") -> str:
+    """What the monitor said of a slip, and what its words mean."""
+    assert effect.slip_index is not None
+    said = [f"The object leaves the blade at {effect.times[effect.slip_index]:.2f} s."]
+    if sure is not None:
+        said.append(
+            f"At {sure.time:.2f} s (dotted) the monitor knows: a slip is now the most probable outcome."
+        )
+    if alarm is not None:
+        said.append(f"At {alarm.time:.2f} s it raises an alarm.")
+    elif sure is not None:
+        said.append(
+            "It raises no alarm, since a slip was foreseen as possible: alarms are for motions that nothing foreseen "
+            "explains. So the score stays below the threshold."
+        )
+    return " ".join(said) + (
+        " Worlds (grey) are the motions predicted with the frictions, density and contact that may be. The score is "
+        "the largest deviation so far from the one that fits best, in widths of the band about it: 1 mm, and more "
+        "where it is fast. Above the threshold it is an alarm."
+    )
 
 
 def _slip(seed: int) -> "tuple[Prism, LeverUp, Effect]":
@@ -217,13 +281,14 @@ def _slip(seed: int) -> "tuple[Prism, LeverUp, Effect]":
             return prism, action, effect
 
 
-def write_page(out: Path, pictures: Pictures) -> Path:
+def write_page(out: Path, pictures: list[Picture]) -> Path:
     """One page in HTML with all pictures, beside them."""
     from foretrace.files import write_text
 
     figures = "\n".join(
-        f'<figure><figcaption>{escape(what)}</figcaption><img src="{escape(name)}" alt="{escape(what)}"></figure>'
-        for name, what in pictures
+        f"<figure><figcaption><h2>{escape(each.title)}</h2><p>{escape(each.about)}</p></figcaption>"
+        f'<img src="{escape(each.file)}" alt="{escape(each.title)}"></figure>'
+        for each in pictures
     )
     write_text(out / "index.html", PAGE.format(figures=figures))
     return out / "index.html"

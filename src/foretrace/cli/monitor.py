@@ -122,7 +122,9 @@ def monitor(
     if out.suffix.lower() in FILMS:
         monitor_film(watched.scene, watched.imagined, watched.verdicts, out)
     else:
-        figure = monitor_figure(watched.imagined, watched.verdicts, watched.com, watched.scene.title)
+        figure = monitor_figure(
+            watched.imagined, watched.verdicts, watched.com, watched.scene.title, watched.scene.source
+        )
         with atomic_path(out) as temporary:
             figure.savefig(temporary, format=out.suffix[1:].lower())
     alarm, last = next((each for each in watched.verdicts if each.alarm), None), watched.verdicts[-1]

@@ -87,7 +87,9 @@ class Scene:
     predictions: Mapping[str, np.ndarray]
     """Imagined paths (time, 3) of the centre of mass [m], by name."""
     com: Float[np.ndarray, "time 3"] | None = None
-    """Observed path of the centre of mass [m]."""
+    """Path of the centre of mass as it was observed or simulated [m]."""
+    source: str = "observed"
+    """What that path is called: ``observed`` or ``simulated``."""
     tool: Float[np.ndarray, "time 7"] | None = None
     """Blade tip over time."""
     support_points: Float[np.ndarray, "2 2"] | None = None
@@ -123,6 +125,7 @@ class Scene:
             pose=effect.pose_trajectory,
             predictions=_checked(predictions or {}),
             com=effect.com_trajectory,
+            source="simulated" if interaction.provenance.source == "simulated" else "observed",
             tool=effect.tool_trajectory,
             support_points=effect.support_points if known else None,
             slip_index=effect.slip_index,
@@ -166,8 +169,8 @@ class Scene:
         return self.obj.corners @ self.placement[:2, :2].T + self.placement[:2, 3]
 
     def paths(self) -> list[Trace]:
-        """Everything to trace; the observed path first."""
-        traced = [] if self.com is None else [Trace("observed", self.com, TRUTH_COLOR, "-", 2.4)]
+        """Everything to trace; what happened first."""
+        traced = [] if self.com is None else [Trace(self.source, self.com, TRUTH_COLOR, "-", 2.4)]
         for k, (name, path) in enumerate(self.predictions.items()):
             k %= len(PREDICTION_COLORS)
             traced.append(Trace(name, path, PREDICTION_COLORS[k], PREDICTION_LINES[k], 1.8))

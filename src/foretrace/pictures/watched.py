@@ -40,18 +40,20 @@ def monitor_figure(
     verdicts: Sequence[Verdict],
     com: Float[np.ndarray, "time 3"],
     title: str,
+    source: str = "observed",
 ) -> Figure:
     """Score, outcomes and height of one execution over time.
 
     Args:
         imagined: What was imagined.
         verdicts: The verdict at each sample, at least one.
-        com: Observed centre of mass at each sample, in the action frame [m]; NaN where it was not tracked.
+        com: Centre of mass at each sample, in the action frame [m]; NaN where it was not tracked.
         title: Title.
+        source: What the motion is called: ``observed`` or ``simulated``.
     """
     fig = new_figure(7.2, 7.0)
     axes = list(fig.subplots(3, 1, sharex=True, height_ratios=(3, 2, 3)))
-    _draw_verdicts(axes, imagined, verdicts, com)
+    _draw_verdicts(axes, imagined, verdicts, com, source)
     alarm = _alarm(verdicts)
     if alarm is not None:
         last, top = verdicts[-1].cause, axes[0].get_ylim()[1]
@@ -92,7 +94,7 @@ def monitor_film(
     scene = replace(scene, predictions={"imagined": imagined.com_trajectory}, ghosts=ghosts)
 
     def diagrams(axes: list[Axes], _: Scene) -> None:
-        _draw_verdicts(axes, imagined, verdicts, com)
+        _draw_verdicts(axes, imagined, verdicts, com, scene.source)
         for ax in axes[:2]:
             ax.tick_params(labelbottom=False)
         axes[0].set_title("score, outcomes, height", fontsize=9)
@@ -126,6 +128,11 @@ def _alarm(verdicts: Sequence[Verdict]) -> Verdict | None:
     return next((each for each in verdicts if each.alarm), None)
 
 
+def turning_point(verdicts: Sequence[Verdict]) -> Verdict | None:
+    """The first verdict by which another outcome than the one expected at first has taken over."""
+    return next((each for each in verdicts if each.transition), None)
+
+
 def _words(alarm: Verdict) -> str:
     return f"alarm at {alarm.time:.2f} s: {alarm.cause}"
 
@@ -144,8 +151,9 @@ def _draw_verdicts(
     imagined: ImaginedEffect,
     verdicts: Sequence[Verdict],
     com: Float[np.ndarray, "time 3"],
+    source: str,
 ) -> None:
-    """Score, outcomes and height over time, one below the other, and when there was an alarm."""
+    """Score, outcomes and height over time, one below the other, with the moments of alarm and change of outcome."""
     score, outcomes, height = axes
     times = np.array([each.time for each in verdicts])
     values = np.array([each.score for each in verdicts])
@@ -153,22 +161,34 @@ def _draw_verdicts(
     score.axhline(verdicts[0].threshold, color=INK, linestyle="--", linewidth=1.0, label="threshold")
     score.set_yscale("log")
     score.set_ylim(0.05, max(20.0, 1.5 * values.max()))
-    score.set_ylabel("widths of the band")
+    score.set_ylabel("score [widths of the band]")
     names = [name for name in verdicts[0].outcomes if max(each.outcomes[name] for each in verdicts) > 0.01]
     for name in names:
         color = OUTCOME_COLORS.get(name, GREY)
         outcomes.plot(times, [each.outcomes[name] for each in verdicts], color=color, label=name)
     outcomes.set_ylim(-0.03, 1.03)
     outcomes.set_ylabel("probability")
-    _draw_height(height, imagined, times, com)
+    _draw_height(height, imagined, times, com, source)
     alarm = _alarm(verdicts)
     if alarm is not None:
         for ax in axes:
             ax.axvline(alarm.time, color=PREDICTION_COLORS[0], linewidth=1.0)
+    turn = turning_point(verdicts)
+    if turn is not None:
+        for ax in axes:
+            ax.axvline(turn.time, color=INK, linestyle=":", linewidth=1.0)
+        late = turn.time > times.mean()
+        text = f"{turn.time:.2f} s: {max(turn.outcomes, key=turn.outcomes.__getitem__)} takes over"
+        outcomes.annotate(text, (turn.time, 0.5), (-14 if late else 14, 0), textcoords="offset points",
+                          ha="right" if late else "left", va="center", fontsize=8)  # fmt: skip
 
 
 def _draw_height(
-    axes: Axes, imagined: ImaginedEffect, times: Float[np.ndarray, " time"], com: Float[np.ndarray, "time 3"]
+    axes: Axes,
+    imagined: ImaginedEffect,
+    times: Float[np.ndarray, " time"],
+    com: Float[np.ndarray, "time 3"],
+    source: str,
 ) -> None:
     """Height of the centre of mass, as imagined and as seen."""
     worlds = imagined.worlds
@@ -185,7 +205,7 @@ def _draw_height(
         linestyle="--",
         label="imagined",
     )
-    axes.plot(times, CM * com[:, 2], color=TRUTH_COLOR, linewidth=1.8, label="observed")
+    axes.plot(times, CM * com[:, 2], color=TRUTH_COLOR, linewidth=1.8, label=source)
     axes.set_xlim(times[0], max(float(times[-1]), float(times[0]) + 0.1))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("height [cm]")
