@@ -138,6 +138,32 @@ def test_many_contacts_and_images_give_the_predictions_of_one_by_one(tmp_path: P
     assert float(row["moved_x_m"]) > 0.02, "away from the blade, in the image's frame"
 
 
+def test_images_that_cannot_be_used_are_told_and_the_others_predicted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("b.png", "d.png"):
+        shutil.copy(ASSETS / MASK, images / name)
+    (images / "a.png").write_text("no image")
+    Image.new("L", (200, 200)).save(images / "c.png")
+    (images / "e.png").mkdir()
+    many = ["predict", "--images", str(images), *OBJECT[2:], "--contacts", "3", "--out", str(tmp_path)]
+    assert cli.main(many) == 1
+    assert [row["object"] for row in table(tmp_path / "predictions.csv")] == ["b.png"] * 3 + ["d.png"] * 3
+    told = capsys.readouterr().err.splitlines()
+    assert [Path(line.split(": ")[1].split(" ")[0]).name for line in told[:-1]] == ["a.png", "c.png", "e.png"]
+    assert told[-1] == "foretrace: 3 of 5 images cannot be used and have no row: mend or remove them"
+    for name in ("b.png", "d.png"):
+        (images / name).unlink()
+    (tmp_path / "predictions.csv").unlink()
+    assert cli.main(many) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 4
+    assert "3 of 3 images cannot be used" in told[-1]
+    assert not (tmp_path / "predictions.csv").exists()
+
+
 def test_the_bevel_is_the_object_s_and_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["predict", *OBJECT, "--contact", *map(str, CONTACT), "--no-animation", "--out"]
     assert cli.main([*command, str(tmp_path / "own"), "--bevel-height", "0.0024", "--compare"]) == 0
@@ -178,7 +204,6 @@ def test_the_bevel_is_the_object_s_and_is_told(tmp_path: Path, capsys: pytest.Ca
         (["--images", "{folder}/none", "--scale", "0.1", "--contacts", "3"], "is no folder"),
         (["--images", "{folder}", "--scale", "0.1", "--contacts", "3"], "has no images (.png"),
         (["--images", "{assets}", "--contacts", "3"], "--image needs --scale"),
-        (["--images", "{assets}", "--scale", "5", "--contacts", "3"], "mask.png: "),
     ],
 )
 def test_what_cannot_be_predicted_is_refused(

@@ -80,9 +80,9 @@ OUTPUT_CLOSED = 141
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status.
 
-    0: done. 1: `data` has something left to mend, or a trial of `evaluate` failed. 2: an error, printed as
-    one line. 128 and the number of a signal that asked to end: 130 after Ctrl-C, 143 after `kill`, 129 after a closed
-    terminal. 141: the output was closed.
+    0: done. 1: `data` has something left to mend, a trial of `evaluate` failed, or `predict --images` left out
+    images. 2: an error, printed as one line. 128 and the number of a signal that asked to end: 130
+    after Ctrl-C, 143 after `kill`, 129 after a closed terminal. 141: the output was closed.
     """
     if threading.current_thread() is threading.main_thread():
         # `kill`, batch systems and a closed terminal are obeyed as Ctrl-C is: workers end, and what is done is kept.

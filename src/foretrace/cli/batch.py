@@ -2,16 +2,17 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from foretrace.cli.console import say
 from foretrace.cli.contact import ContactOptions
 from foretrace.cli.objects import ObjectOptions
-from foretrace.errors import ForetraceError, PredictionError
+from foretrace.errors import CommandError, ForetraceError, PredictionError
 from foretrace.imagined.shown import LEVEL
 
 if TYPE_CHECKING:
@@ -62,8 +63,10 @@ def predict_many(
     told: Callable[["ObjectModel"], Mapping[str, float]],
     path: Any,
     out: Path,
-) -> None:
+) -> int:
     """Predict every object at every contact, and write a table.
+
+    Images that cannot be used are told in a line each, and the others predicted.
 
     Args:
         predictor: The predictor.
@@ -74,9 +77,13 @@ def predict_many(
         path: The tool's path.
         out: Folder of the table.
 
+    Returns:
+        The exit status: 1 where some images cannot be used.
+
     Raises:
-        PredictionError: Options do not go together, or a folder has no images.
-        ForetraceError: An object cannot be used; names its file.
+        CommandError: Options do not go together.
+        PredictionError: They do not, a folder has no images, or none of its images can be used.
+        ForetraceError: The only object cannot be used.
     """
     from foretrace.files import write_text
 
@@ -88,26 +95,39 @@ def predict_many(
         if not 1 <= many.contacts <= MOST_CONTACTS:
             raise PredictionError(f"--contacts is {many.contacts}: give a number from 1 to {MOST_CONTACTS}")
     rows: list[Row] = []
-    for name, one in _objects(obj, many):
+    objects, failed = _objects(obj, many), 0
+    for name, one in objects:
         try:
             rows += _predict(predictor, name, one, at, many.contacts, told, path)
+        except CommandError:
+            raise
         except ForetraceError as error:
-            raise error if many.images is None else type(error)(f"{many.images / name}: {error}") from error
+            if many.images is None:
+                raise
+            failed += 1
+            file = str(many.images / name)
+            say(error if str(error).startswith(file) else f"{file}: {error}")
+    if failed == len(objects):
+        raise PredictionError(
+            f"{failed} of {failed} images cannot be used: nothing is written; mend or remove them"
+        )
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([Row._fields, *rows])
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / TABLE, text.getvalue())
     print(f"{len(rows)} predictions: {out / TABLE}")
+    if failed:
+        say(f"{failed} of {len(objects)} images cannot be used and have no row: mend or remove them")
+    return int(failed > 0)
 
 
-def _objects(obj: ObjectOptions, many: ManyOptions) -> Iterator[tuple[str, ObjectOptions]]:
+def _objects(obj: ObjectOptions, many: ManyOptions) -> list[tuple[str, ObjectOptions]]:
     """Each object's name, and the options that give it."""
     from foretrace.images import SUFFIXES
 
     if many.images is None:
         file = obj.polygon or obj.image or obj.mesh
-        yield "" if file is None else file.name, obj
-        return
+        return [("" if file is None else file.name, obj)]
     if obj.polygon is not None or obj.image is not None or obj.mesh is not None:
         raise PredictionError("--images shows the objects: leave out --polygon, --image and --mesh")
     if not many.images.is_dir():
@@ -115,8 +135,7 @@ def _objects(obj: ObjectOptions, many: ManyOptions) -> Iterator[tuple[str, Objec
     files = sorted(file for file in many.images.iterdir() if file.suffix.lower() in SUFFIXES)
     if not files:
         raise PredictionError(f"{many.images} has no images ({', '.join(SUFFIXES)}): give another --images")
-    for file in files:
-        yield file.name, replace(obj, image=file)
+    return [(file.name, replace(obj, image=file)) for file in files]
 
 
 def _predict(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from foretrace.actions import Action, LeverUp
-from foretrace.errors import PredictionError
+from foretrace.errors import CommandError
 from foretrace.objects import ObjectModel
 
 
@@ -24,21 +24,21 @@ class ContactOptions:
         """Edge, and share of it before the contact; None without an edge.
 
         Raises:
-            PredictionError: A share of no edge is given.
+            CommandError: A share of no edge is given.
         """
         if self.edge is None and self.fraction is not None:
-            raise PredictionError("--fraction goes with --edge: give one, or leave it out")
+            raise CommandError("--fraction goes with --edge: give one, or leave it out")
         return None if self.edge is None else (self.edge, 0.5 if self.fraction is None else self.fraction)
 
     def place(self, obj: ObjectModel, kind: type[Action] = LeverUp) -> Action:
         """The action on an object, by default a lever-up.
 
         Raises:
-            PredictionError: Options do not go together.
+            CommandError: Options do not go together.
             ActionError: There is no such edge, or the point is too far from the outline.
         """
         if (self.edge is None) == (self.contact is None):
-            raise PredictionError("give either --edge (with --fraction) or --contact X Y")
+            raise CommandError("give either --edge (with --fraction) or --contact X Y")
         if self.share is not None:
             return kind.at_edge(obj, *self.share)
         assert self.contact is not None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from foretrace.errors import PredictionError
+from foretrace.errors import CommandError, PredictionError
 from foretrace.perception.photo import PhotoConfig
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class ObjectOptions:
         """The object, and the mask of an image.
 
         Raises:
-            PredictionError: Not exactly one object is given, or options do not go together.
+            CommandError: Not exactly one object is given, or options do not go together.
             ShapeError: The object cannot be used.
         """
         from foretrace.objects import MeshObject, Prism
@@ -52,19 +52,17 @@ class ObjectOptions:
 
         given = [f"--{name}" for name in ("polygon", "image", "mesh") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise PredictionError(
+            raise CommandError(
                 f"{' and '.join(given) or 'no object'} given: give exactly one of --polygon, --image, --mesh"
             )
         if self.rest and self.mesh is None:
-            raise PredictionError("--rest goes with --mesh: the others lie flat already")
+            raise CommandError("--rest goes with --mesh: the others lie flat already")
         if self.height is not None and self.mesh is not None:
-            raise PredictionError("--height goes with --polygon and --image: a mesh has its own")
+            raise CommandError("--height goes with --polygon and --image: a mesh has its own")
         if self.image is None and (self.label is not None or self.invert):
-            raise PredictionError("--label and --invert go with --image: leave them out")
+            raise CommandError("--label and --invert go with --image: leave them out")
         if self.label is not None and self.invert:
-            raise PredictionError(
-                "--label and --invert given: a label names the object already, leave one out"
-            )
+            raise CommandError("--label and --invert given: a label names the object already, leave one out")
         height = DEFAULT_HEIGHT if self.height is None else self.height
         if self.polygon is not None:
             corners = check_polygon(read_polygon(self.polygon, self.scale))
@@ -72,7 +70,7 @@ class ObjectOptions:
         if self.mesh is not None:
             return MeshObject.load(self.mesh, 1.0 if self.scale is None else self.scale, rest=self.rest), None
         if self.scale is None or self.image is None:
-            raise PredictionError("--image needs --scale, the metres per pixel")
+            raise CommandError("--image needs --scale, the metres per pixel")
         mask = read_silhouette_image(self.image, self._label(), self.invert)
         return Prism.from_mask(mask, self.scale, height), mask
 
@@ -83,7 +81,7 @@ class ObjectOptions:
         try:
             return [float(value) for value in self.label.split(",")]
         except ValueError:
-            raise PredictionError(
+            raise CommandError(
                 f"--label is {self.label}: give a number, or red, green and blue as 128,0,0"
             ) from None
 

@@ -61,11 +61,12 @@ def predict(
     compare: bool = False,
     animation: bool = True,
     out: Path = Path("prediction"),
-) -> None:
+) -> int | None:
     """Predict the motion of an object before it is touched.
 
     Give the object as --polygon, --image or --mesh, and the contact as --edge or --contact; or give a --photo of the
-    table and --contact-px. --example needs none of them. --images and --contacts write one table of many predictions.
+    table and --contact-px. --example needs none of them. --images and --contacts write one table of many predictions;
+    the exit status is 1 if some images cannot be used.
 
     Args:
         obj: The object: exactly one of --polygon, --image, --mesh.
@@ -87,7 +88,7 @@ def predict(
     given = [*photo.given(), *_changed(obj), *_changed(at)]
     if run is not None and run.is_file() and run.suffix == ".json":
         _show_plan(run, out, [*given, *_changed(context), *_changed(many), *["--example"] * example])
-        return
+        return None
     if example:
         if idle := [*given, *_changed(many)]:
             raise PredictionError(f"--example has object and contact: leave out {', '.join(idle)}")
@@ -101,8 +102,8 @@ def predict(
     if _changed(many):
         if idle := [*photo.given(), *["--compare"] * compare]:
             raise PredictionError(f"--images and --contacts go without {', '.join(idle)}: leave it out")
-        predict_many(predictor, obj, at, many, partial(_told, values, predictor.context, unknown), path, out)
-        return
+        told = partial(_told, values, predictor.context, unknown)
+        return predict_many(predictor, obj, at, many, told, path, out)
     seen = None
     if photo.photo is not None:
         if replace(obj, height=None) != ObjectOptions() or at != ContactOptions():
@@ -135,6 +136,7 @@ def predict(
     print("\n".join(str(file) for file in sorted(out.iterdir()) if file.is_file()))
     if example:
         say_example(out / EXAMPLE)
+    return None
 
 
 def _draw(
