@@ -1,4 +1,4 @@
-"""Add an action of your own, a nudge with a rod, and record it: python examples/own_action.py FOLDER."""
+"""Add an action of your own, and record it (extras sim and bullet). Usage: python examples/own_action.py FOLDER."""
 
 import sys
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ class NudgePath:
 
 
 @dataclass(frozen=True, eq=False)
-class Nudge(ft.Action):
+class Nudge(ft.Action):  # with a rod
     label, outcomes = "nudge", ("nudged", "toppled", "missed")
     path: NudgePath = NudgePath()
     tool: Rod = field(default_factory=Rod)
@@ -49,10 +49,10 @@ class Nudges(Families):  # of the paper's objects, where it levers them
 
 
 if __name__ == "__main__":
+    folder = sys.argv[1] if len(sys.argv) == 2 else sys.exit(__doc__)
     RECIPES.add("nudges", Nudges(("prism",)))  # in a package: an entry point of the group foretrace.recipes
-    config = ft.CollectConfig(1, 1, 0, ft.SimulationConfig(embodiment="tool"), "nudges")
-    ft.collect(config, sys.argv[1], workers=1)
-    for stored in ft.Dataset.open(sys.argv[1]):
+    ft.collect(ft.CollectConfig(1, 1, 0, ft.SimulationConfig(embodiment="tool"), "nudges"), folder, workers=1)
+    for stored in ft.Dataset.open(folder):
         same = np.array_equal(ft.replay(stored).effect.com_trajectory, stored.effect.com_trajectory)
         again = ft.simulate(stored.object, stored.action, engine="bullet", embodiment="tool")
         ways = (each.effect.com_trajectory for each in (stored, again))

@@ -1,4 +1,4 @@
-"""Read a data set: filter it, take it as arrays, as a table, as single interactions.
+"""Read a data set: filter it, take it as arrays, as a table, as single interactions; needs the extras sim and eval.
 
     python examples/read_a_data_set.py [DATA]
 

@@ -69,6 +69,13 @@ for attempt in (
     except ft.ForetraceError as error:
         print(error)
 assert main(["predict", "--example", "--out", "out"]) == 0
+found.save("plan.json")
+poses = found.imagined.object_poses(found.action.T_action_object)
+with open("poses.csv", "w") as file:
+    print("time_s,x_m,y_m,z_m,qw,qx,qy,qz", file=file)
+    for time, pose in zip(found.imagined.times, poses):
+        print(time, *pose, sep=",", file=file)
+assert main(["monitor", "plan.json", "--poses", "poses.csv", "--out", "monitor.png"]) == 0
 for command in (["train", "--help"], ["simulate", "--out", "d"], ["evaluate", "predictor", "r", "--data", "d"]):
     assert main(command) == 2, command
 """

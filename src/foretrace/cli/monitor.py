@@ -14,7 +14,6 @@ from foretrace.errors import DatasetError, MonitoringError
 from foretrace.files import atomic_path, make_folder
 from foretrace.geometry import invert_transform, matrix_to_pose, pose_to_matrix, transform_points
 from foretrace.imagined import Belief, ImaginedEffect
-from foretrace.interactions.dataset import Dataset
 from foretrace.monitoring import Monitor, Verdict
 from foretrace.monitoring.causes import BAD_INPUT
 from foretrace.pictures.scene import Scene
@@ -138,6 +137,8 @@ def monitor(
 def _watch_interaction(
     data: Path, id: int, run: Path | None, belief: Belief, false_alarms: float, calibration: Path | None
 ) -> _Watched:
+    from foretrace.interactions.dataset import Dataset
+
     dataset = Dataset.open(data)
     rows = np.flatnonzero(dataset.index["id"].to_numpy() == id)
     if len(rows) == 0:

@@ -245,7 +245,12 @@ def _write_trajectory(
     content: dict[str, Any] = {
         "predictor": "default" if run is None else str(run),
         "frame": "action: origin at the contact point on the table top, x along the action, y left, z up",
-        "units": {"times": "s", "com_trajectory": "m"},
+        "units": {
+            "times": "s",
+            "com_trajectory": "m",
+            "pose_trajectory": "m, quaternion w x y z",
+            "radius": "m",
+        },
         "object": obj.to_dict(),
         "contact": action.contact.tolist(),
         "direction": action.direction.tolist(),
