@@ -129,6 +129,9 @@ def test_bodies_are_bounded_and_have_to_be_json(client):
     assert chunked.status_code == 413
     broken = client.post("/predict", content=b"{", headers={"content-type": "application/json"})
     assert (broken.status_code, broken.json()["detail"][:22]) == (400, "the body is no JSON: s")
+    unnamed = client.post("/predict", content=json.dumps(KNOWN))  # as curl -d without the header
+    assert unnamed.status_code == 422
+    assert unnamed.json()["detail"].endswith("add the header Content-Type: application/json")
     infinite = client.post(
         "/predict",
         content=json.dumps(KNOWN | {"level": np.nan}),
@@ -186,6 +189,26 @@ def test_the_page_and_the_description_need_nothing_from_elsewhere(client):
         "/monitors/{id}",
         "/monitors/{id}/samples",
     }
+
+
+def test_every_property_and_answer_is_described(client):
+    schemas = client.get("/openapi.json").json()["components"]["schemas"]
+    bare = [
+        f"{name}.{key}"
+        for name, each in schemas.items()
+        if name not in ("HTTPValidationError", "ValidationError")
+        for key, value in each["properties"].items()
+        if not value.get("description")
+    ]
+    assert bare == []
+    told = client.post("/predict", json=KNOWN).json()
+    assert set(told) == set(schemas["Predicted"]["properties"])
+    assert set(told["futures"][0]) == set(schemas["FutureTold"]["properties"])
+    plan = client.post("/plan", json={"object": OBJECT, "goal": {"name": "turn", "angle": 0.2}, "check": 0})
+    assert set(schemas["Planned"]["properties"]) <= set(plan.json())
+    id = client.post("/monitors", json=KNOWN | {"worlds": 0}).json()["id"]
+    verdict = client.post(f"/monitors/{id}/samples", json={"samples": [{"t": 0, "pose": None}]}).json()
+    assert set(verdict) == set(schemas["VerdictTold"]["properties"])
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):

@@ -23,7 +23,7 @@ Matrix = Annotated[
     list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
 ]
 ConstantName = Literal["friction", "tool_friction", "density", "contact_error", "bevel_width", "bevel_height"]
-GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "slide-off"]
+GoalName = Literal["lift", "tilt", "tumble", "turn-over", "move", "move-to", "turn", "slide-off"]
 MOST_KEPT = 32
 """Objects that are kept for further requests about them, at most."""
 MOST_SAMPLES = 1000
@@ -32,15 +32,16 @@ assert set(CONSTANTS) == set(ConstantName.__args__)
 
 
 class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
 
 class PrismBody(_Body):
     """An outline, extruded."""
 
     kind: Literal["prism"]
+    """An outline, extruded."""
     corners: Annotated[list[Point], Field(min_length=3, max_length=MOST_CORNERS)]
-    """Corners of the outline in the object's frame [m]."""
+    """Corners x, y of the outline in the object's frame [m]."""
     height: Number = DEFAULT_HEIGHT
     """Height [m]."""
     bevel: Point | None = None
@@ -58,6 +59,7 @@ class BoxBody(_Body):
     """A box."""
 
     kind: Literal["box"]
+    """A box."""
     length: Number
     """Along x [m]."""
     width: Number
@@ -74,6 +76,7 @@ class CylinderBody(_Body):
     """A cylinder that lies on its side."""
 
     kind: Literal["cylinder"]
+    """A cylinder that lies on its side."""
     radius: Number
     """Radius [m]."""
     length: Number
@@ -97,9 +100,10 @@ class ActionBody(_Body):
     """A lever-up on the object."""
 
     contact: Point
-    """Point of the outline where the blade meets it, in the object's frame [m]."""
+    """Point x, y of the outline where the blade meets it, in the object's frame [m]."""
     direction: Point | None = None
-    """Direction of the action there; by default the inward normal at the nearest point of the outline."""
+    """Direction x, y of the action there, in the object's frame; by default the inward normal at
+    the nearest point of the outline."""
     insertion: Number = ToolPath.insertion
     """Distance that the blade is pushed under the object [m]."""
     arc_radius: Number = ToolPath.arc_radius
@@ -126,8 +130,10 @@ class Known(_Body):
     """An object, and what is known of its physics."""
 
     object: ObjectBody
+    """The object."""
     context: ContextBody = None
-    """Constants that are known, by name [SI]; null: the nominal ones; ``unknown``: none."""
+    """Constants that are known, by name: friction, tool_friction, density [kg/m^3], contact_error, bevel_width,
+    bevel_height [m]; null: the nominal ones; ``unknown``: none."""
 
     def make_object(self) -> ObjectModel:
         """The object; for a description that was sent lately the same again, with all that is known of its shape."""
@@ -138,6 +144,7 @@ class PredictBody(Known):
     """What is to be predicted."""
 
     action: ActionBody
+    """The lever-up."""
     level: Annotated[FiniteFloat, Field(ge=0.01, le=0.99)] = 0.9
     """Probability of the region whose radii are given."""
     most_futures: Annotated[int, Field(ge=1, le=16)] = 3
@@ -148,16 +155,27 @@ class GoalBody(_Body):
     """What is to happen, in the object's frame; each goal has entries of its own, those of its class in `ft.goals`."""
 
     name: GoalName
+    """Which goal."""
     max_slip: Number | None = None
+    """lift, tilt, move: largest accepted probability of a slip."""
     at_least: Number | None = None
+    """lift, move: rise or distance from which on the goal counts as reached [m]."""
     angle: Number | None = None
+    """tilt: angle to the horizontal; turn: turn to the left about the vertical [rad]."""
     edge: int | None = None
+    """turn-over: the outline's edge to turn over; edge k runs from corner k to corner k + 1."""
     direction: Point | None = None
+    """turn-over, move: direction x, y."""
     position: Point | None = None
+    """move-to: where the centre of mass shall end, x, y [m]."""
     turn: Number | None = None
+    """move-to: turn about the vertical at the end [rad]."""
     tolerance: Number | None = None
+    """tilt, turn [rad], move-to [m]: deviation up to which the goal counts as reached."""
     point: Point | None = None
+    """slide-off: a point x, y of the table's edge [m]."""
     outward: Point | None = None
+    """slide-off: direction x, y off the table."""
 
     def make(self) -> goals.Goal:
         """The goal.
@@ -183,6 +201,7 @@ class PlanBody(Known):
     """What is to be planned."""
 
     goal: GoalBody
+    """What is to happen."""
     spacing: Annotated[FiniteFloat, Field(ge=0.002, le=0.1)] = 0.005
     """Distance of contacts along the outline [m]."""
     refine: Annotated[int, Field(ge=0, le=4)] = 2
@@ -192,7 +211,7 @@ class PlanBody(Known):
     seed: Annotated[int, Field(ge=0, le=2**31)] = 0
     """Decides what is drawn."""
     T_table_object: Matrix | None = None
-    """The object's pose in the table frame, where the plan is for a robot."""
+    """The object's frame in the table frame, where the plan is for a robot: rows of a homogeneous matrix [m]."""
 
     def config(self) -> PlanConfig:
         """How candidates are searched."""
@@ -203,15 +222,17 @@ class MonitorBody(Known):
     """What is to be watched."""
 
     action: ActionBody
+    """The lever-up."""
     worlds: Annotated[int, Field(ge=0, le=256)] = 128
     """Worlds of a belief over friction, density and execution error, of which the context has what is known; 0: what
     is predicted in the context alone."""
     false_alarms: Number = 0.05
     """Share of whole normal executions that alarm, at most."""
     rest: Annotated[list[Number], Field(min_length=7, max_length=7)] | None = None
-    """Pose of the object's frame at rest, where it is known."""
+    """Pose of the object's frame at rest, where it is known, as in samples."""
     T_table_action: Matrix | None = None
-    """The action frame in the table frame, where poses are tracked in the table frame."""
+    """The action frame in the table frame, where poses are tracked in the table frame: rows of a homogeneous matrix
+    [m]."""
     clock_error: Number = 0.0
     """Largest error of the tracker's clock [s]."""
 
@@ -222,10 +243,12 @@ class Sample(_Body):
     t: float
     """Time since the moment before the blade moves [s]."""
     pose: Pose | None
-    """Position [m] and quaternion (w, x, y, z) of the object's frame; null: the tracker lost it."""
+    """Position x, y, z [m] and quaternion w, x, y, z of the object's frame, in the action frame, or in the table frame
+    where T_table_action was given; null: the tracker lost it."""
 
 
 class SamplesBody(_Body):
     """Tracked samples, in the order of their times."""
 
     samples: Annotated[list[Sample], Field(min_length=1, max_length=MOST_SAMPLES)]
+    """The samples."""

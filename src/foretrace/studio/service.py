@@ -11,7 +11,6 @@ import uvicorn
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse
-from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -25,6 +24,7 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.monitoring import Monitor, Verdict
 from foretrace.objects import ObjectModel, Prism
 from foretrace.planning import plan
+from foretrace.studio.answers import Begun, Planned, Predicted, Refused, VerdictTold
 from foretrace.studio.bodies import ActionBody, MonitorBody, PlanBody, PredictBody, SamplesBody
 from foretrace.studio.session import TWIN, learned
 from foretrace.studio.watches import LIFE, BusyError, UnknownWatchError, Watches
@@ -36,25 +36,8 @@ MOST_CONNECTIONS = 64
 """Connections at once, at most."""
 MOST_PLANS, PATIENCE = 2, 20.0
 """Plans that are worked out at once; how long others wait for their turn [s]."""
+JSON_HEADER = "Content-Type: application/json"
 ABOUT = "Predict how an object will move before a robot touches it, choose where to lever it, and watch the execution."
-
-
-class Refused(BaseModel):
-    """Why a request was refused."""
-
-    detail: str
-    """In one line, with the remedy."""
-
-
-class Begun(BaseModel):
-    """A monitor that has begun."""
-
-    id: str
-    """Name of the monitor in addresses."""
-    threshold: float
-    """Score above which there is an alarm."""
-    life: float
-    """It is forgotten this long after it was last asked [s]."""
 
 
 REFUSALS: dict[int | str, dict[str, Any]] = {
@@ -152,8 +135,12 @@ def _refuse(app: FastAPI) -> None:
         return JSONResponse({"detail": str(error)}, status)
 
     @app.exception_handler(RequestValidationError)
-    def invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+    def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
+        if first["loc"] == ("body",) and "json" not in request.headers.get("content-type", ""):
+            return JSONResponse(
+                {"detail": f"the body is not sent as JSON: add the header {JSON_HEADER}"}, 422
+            )
         if first["type"] == "json_invalid":
             return JSONResponse(
                 {"detail": "the body is no JSON: send an object as /openapi.json has it"}, 400
@@ -172,7 +159,7 @@ def _add_predictions(app: FastAPI) -> None:
     @app.post(
         "/predict",
         responses=REFUSALS,
-        response_model=dict[str, Any],
+        response_model=Predicted,
         summary="Predict the effect of a lever-up",
     )
     def predict(body: PredictBody) -> Response:
@@ -181,9 +168,7 @@ def _add_predictions(app: FastAPI) -> None:
         imagined = imagine(obj, body.action, body.context)
         return _json({"times": imagined.times.tolist(), **imagined.to_dict(body.level, body.most_futures)})
 
-    @app.post(
-        "/plan", responses=REFUSALS, response_model=dict[str, Any], summary="Choose a lever-up for a goal"
-    )
+    @app.post("/plan", responses=REFUSALS, response_model=Planned, summary="Choose a lever-up for a goal")
     def make_plan(body: PlanBody) -> Response:
         """The best lever-up, as `foretrace plan` writes it to plan.json."""
         obj, goal = body.make_object(), body.goal.make()
@@ -230,7 +215,7 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
     @app.post(
         "/monitors/{id}/samples",
         responses=REFUSALS | UNKNOWN,
-        response_model=dict[str, Any],
+        response_model=VerdictTold,
         summary="Give it samples",
     )
     def update(id: str, body: SamplesBody) -> Response:
@@ -241,7 +226,7 @@ def _add_monitors(app: FastAPI, watches: Watches) -> None:
         return _json(_told(verdicts[-1]))
 
     @app.get(
-        "/monitors/{id}", responses=UNKNOWN, response_model=dict[str, Any] | None, summary="Its last verdict"
+        "/monitors/{id}", responses=UNKNOWN, response_model=VerdictTold | None, summary="Its last verdict"
     )
     def look(id: str) -> Response:
         """The last verdict; null before the first sample."""
