@@ -60,6 +60,12 @@ def monitor_figure(
         words = _words(alarm)
         words += "" if last == alarm.cause else f", in the end: {last}"
         axes[0].text(alarm.time, top, f" {words}", va="top", color=PREDICTION_COLORS[0])
+    turn = turning_point(verdicts)
+    if turn is not None:
+        late = turn.time > np.mean([each.time for each in verdicts])
+        words = f"{turn.time:.2f} s: {max(turn.outcomes, key=turn.outcomes.__getitem__)} takes over"
+        axes[1].annotate(words, (turn.time, 0.5), (-14 if late else 14, 0), textcoords="offset points",
+                         ha="right" if late else "left", va="center", fontsize=8)  # fmt: skip
     for each in axes:
         each.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     headline(fig, title)
@@ -177,10 +183,6 @@ def _draw_verdicts(
     if turn is not None:
         for ax in axes:
             ax.axvline(turn.time, color=INK, linestyle=":", linewidth=1.0)
-        late = turn.time > times.mean()
-        text = f"{turn.time:.2f} s: {max(turn.outcomes, key=turn.outcomes.__getitem__)} takes over"
-        outcomes.annotate(text, (turn.time, 0.5), (-14 if late else 14, 0), textcoords="offset points",
-                          ha="right" if late else "left", va="center", fontsize=8)  # fmt: skip
 
 
 def _draw_height(
