@@ -39,7 +39,7 @@ class Hidden(importlib.abc.MetaPathFinder):
 sys.meta_path.insert(0, Hidden())
 import importlib.util
 own = importlib.util.find_spec
-importlib.util.find_spec = lambda name, package=None: None if name == "torch" else own(name, package)
+importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EXTRA_OF)} else own(name, package)
 """
 """Begins a program that runs as if no extra were installed."""
 TOUR = """
@@ -76,7 +76,8 @@ with open("poses.csv", "w") as file:
     for time, pose in zip(found.imagined.times, poses):
         print(time, *pose, sep=",", file=file)
 assert main(["monitor", "plan.json", "--poses", "poses.csv", "--out", "monitor.png"]) == 0
-for command in (["train", "--help"], ["simulate", "--out", "d"], ["evaluate", "predictor", "r", "--data", "d"]):
+for command in (["train", "--help"], ["simulate", "--out", "d"], ["evaluate", "predictor", "r", "--data", "d"],
+                ["demo"], ["studio"], ["serve"], ["monitor", "d", "0", "--out", "m.png"]):
     assert main(command) == 2, command
 """
 
@@ -116,8 +117,16 @@ def test_core_works_without_the_extras_and_names_them(tmp_path: Path) -> None:
     ]
     assert lines[2:7] == [needs(*pair) for pair in wanted]
     told = done.stderr.splitlines()
-    wanted = [("torch", "train"), ("pyarrow", "sim"), ("pandas", "eval")]
-    assert told[-3:] == [f"foretrace: error: {needs(*pair)}" for pair in wanted]
+    wanted = [
+        ("torch", "train"),
+        ("pyarrow", "sim"),
+        ("pandas", "eval,sim,train"),
+        ("pandas", "eval,sim,train"),
+        ("pyarrow", "sim,studio"),
+        ("uvicorn", "studio"),
+        ("pyarrow", "sim"),
+    ]
+    assert told[-7:] == [f"foretrace: error: {needs(*pair)}" for pair in wanted]
     assert (tmp_path / "out/prediction.gif").stat().st_size > 100_000
 
 

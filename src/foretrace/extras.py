@@ -1,7 +1,8 @@
 """Libraries that come with extras: one line says which extra is missing."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 from foretrace.errors import ForetraceError
 
@@ -23,13 +24,20 @@ class MissingExtraError(ForetraceError, ModuleNotFoundError):
     """A library of an extra is needed that is not installed."""
 
 
-def missing_extra(error: ImportError) -> MissingExtraError | None:
-    """What to say where a library of an extra is not installed; None where the import failed for another reason."""
+def missing_extra(error: ImportError, needed: Sequence[str] = ()) -> MissingExtraError | None:
+    """What to say where a library of an extra is not installed; None where the import failed for another reason.
+
+    Args:
+        error: What failed.
+        needed: Extras that the work as a whole needs: those that are not installed are named, too.
+    """
     library = (error.name or "").partition(".")[0]
     if not isinstance(error, ModuleNotFoundError) or library not in EXTRA_OF:
         return None
+    absent = {EXTRA_OF[name] for name in EXTRA_OF if EXTRA_OF[name] in needed and find_spec(name) is None}
+    extras = ",".join(sorted({EXTRA_OF[library], *absent}))
     return MissingExtraError(
-        f"this needs {library}, which is not installed: pip install 'foretrace[{EXTRA_OF[library]}]'",
+        f"this needs {library}, which is not installed: pip install 'foretrace[{extras}]'",
         name=library,
     )
 

@@ -17,14 +17,14 @@ import foretrace
 from foretrace.cli.console import say
 from foretrace.cli.parsing import Command, Entry, Group, Ready, parse
 from foretrace.errors import CommandError, ForetraceError, shown
-from foretrace.extras import missing_extra
+from foretrace.extras import MissingExtraError, missing_extra
 
 LEARN, SEE, HAND_ON = "simulate, learn, predict", "cameras and recordings", "other programs and robots"
 """Headings of the list of commands."""
 
 
-def _command(home: str, summary: str, section: str = "", varies: bool = False) -> Command:
-    return Command(summary, f"foretrace.cli.{home}", section, varies)
+def _command(home: str, summary: str, section: str = "", varies: bool = False, extras: str = "") -> Command:
+    return Command(summary, f"foretrace.cli.{home}", section, varies, extras.split())
 
 
 def _experiments() -> dict[str, Command]:
@@ -40,7 +40,9 @@ EXPORTS: dict[str, Entry] = {
     "onnx": _command("export:export_onnx", "The network of a predictor as ONNX."),
 }
 COMMANDS: dict[str, Entry] = {
-    "demo": _command("demo:demo", "Simulate, train, predict and compare in a few minutes.", LEARN),
+    "demo": _command(
+        "demo:demo", "Simulate, train, predict and compare in a few minutes.", LEARN, extras="eval sim train"
+    ),
     "simulate": _command("simulation:simulate", "Simulate lever-ups of many objects into a data set.", LEARN),
     "data": _command("data:data", "Describe, check, repair or upgrade a data set.", LEARN),
     "data-merge": _command("data:merge", "Make one data set of several.", LEARN),
@@ -48,11 +50,15 @@ COMMANDS: dict[str, Entry] = {
     "data-sample": _command("data:sample", "Make a data set of some interactions.", LEARN),
     "train": _command("training:train_command", "Train a predictor on a data set.", LEARN, varies=True),
     "recalibrate": _command("training:recalibrate", "Calibrate a predictor's regions on other data.", LEARN),
-    "evaluate": Group("Evaluate a predictor, or run an experiment.", _experiments, LEARN),
+    "evaluate": Group(
+        "Evaluate a predictor, or run an experiment.", _experiments, LEARN, ("eval", "sim", "train")
+    ),
     "predict": _command("prediction:predict", "Predict the motion of an object before it is touched.", LEARN),
     "plan": _command("planning:plan", "Choose where and how an object is levered for a goal.", LEARN),
     "monitor": _command("monitor:monitor", "Watch a recorded action as a monitor would have.", LEARN),
-    "studio": _command("studio:studio", "Try lever-ups in the browser: draw, drag, plan.", LEARN),
+    "studio": _command(
+        "studio:studio", "Try lever-ups in the browser: draw, drag, plan.", LEARN, extras="sim studio"
+    ),
     "show": _command("data:show", "Draw a data set, or one interaction.", LEARN),
     "calibrate": _command("calibrate:calibrate", "Calibrate a camera, or print its board or markers.", SEE),
     "import": _command("recordings:import_recording", "Turn the recording of a lever-up into data.", SEE),
@@ -155,12 +161,14 @@ def _run(arguments: Sequence[str]) -> int:
                 "free some, and repeat the command" if error.errno in FULL else "check path and permissions"
             )
             return _refuse(f"{where}{error.strerror or error}: {remedy}")
+        except MissingExtraError as error:
+            return _refuse(str(missing_extra(error, _extras_of(arguments))))
         except ForetraceError as error:
             return _refuse(str(error))
         except KeyboardInterrupt as interrupt:
             return _status_of(interrupt)
         except ImportError as error:
-            if (missing := missing_extra(error)) is not None:
+            if (missing := missing_extra(error, _extras_of(arguments))) is not None:
                 return _refuse(str(missing))
             cause: BaseException | None = error
             while cause is not None:
@@ -169,6 +177,12 @@ def _run(arguments: Sequence[str]) -> int:
                 cause = cause.__cause__ or cause.__context__
             raise
     return status or 0
+
+
+def _extras_of(arguments: Sequence[str]) -> Sequence[str]:
+    """Extras that the command needs."""
+    entry = COMMANDS.get(arguments[0])
+    return entry.extras if isinstance(entry, Command | Group) else ()
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -46,6 +46,8 @@ class Command:
     """Heading under which it is listed."""
     varies: bool = False
     """Whether the options depend on other options: the function then makes the command from the words."""
+    extras: Sequence[str] = ()
+    """Extras that it needs, where these are several."""
 
     def load(self, words: Sequence[str]) -> Callable[..., int | None]:
         """The command as a function."""
@@ -66,6 +68,8 @@ class Group:
     """Each by its name within the group; or what makes them, where that takes time."""
     section: str = ""
     """Heading under which it is listed."""
+    extras: Sequence[str] = ()
+    """Extras that each of them needs, where these are several."""
 
     @property
     def members(self) -> "Mapping[str, Entry]":

@@ -15,7 +15,7 @@ def studio(
     export: Path | None = None,
     onnxruntime_web: Path | None = None,
 ) -> None:
-    """Try lever-ups in the browser: draw an object, drag the screwdriver round it, plan. Needs foretrace[studio].
+    """Try lever-ups in the browser: draw an object, drag the screwdriver round it, plan. Needs foretrace[sim,studio].
 
     Every visitor has a page of their own. By default it can be reached from this machine alone.
 
