@@ -15,6 +15,7 @@ from foretrace.imagined import Futures, ImaginedBatch, Imaginer
 from foretrace.planning import Motions
 from foretrace.planning.candidates import Rim, Scene, find_free, place
 from foretrace.planning.goals import GOALS, Constraint, Goal
+from foretrace.planning.reasons import why_lost
 from foretrace.planning.scores import Scores, score, tail_mean
 
 goals = ft.goals
@@ -363,6 +364,23 @@ def test_alternatives_differ_and_say_why_they_lost():
     assert any("slip" in each.lost for each in found.alternatives)
     assert len(found.rim.points) == len(found.rim.cost) > 50
     assert found.lost["slip is too probable"] > 0
+
+
+def test_a_cheaper_alternative_says_why_it_lost():
+    config = ft.PlanConfig(refine=0, check=1)
+    found = ft.plan(
+        PRISM, goals.Lift(max_slip=None), Lever(), checker=Lever(gain=-0.3, name="checker"), config=config
+    )
+    cheaper = [each for each in found.alternatives if each.cost < found.cost]
+    assert cheaper
+    for each in cheaper:
+        assert each.lost.startswith(f"costs {found.cost - each.cost:.2g} less, but as the ")
+        assert each.lost.endswith("has it: it is not among those that the checker checked")
+    assert not any("costs -" in each.lost for each in found.alternatives)
+    assert sum(found.lost.values()) >= len(found.alternatives)
+    one = Scores(np.array([0.2]), np.ones(1), np.array([[0.3]]), np.array([0.5]), ("slip",))
+    assert why_lost(one, 0.201, "").startswith("costs as much to within 0.005, but more where")
+    assert why_lost(one, 0.15, "") == "costs 0.05 more"
 
 
 def test_same_seed_same_plan():

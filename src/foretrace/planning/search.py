@@ -17,6 +17,7 @@ from foretrace.planning.candidates import Candidates, Rim, Scene, find_free, pla
 from foretrace.planning.goals import Goal, describe
 from foretrace.planning.lessons import Lesson, taught
 from foretrace.planning.motions import Motions
+from foretrace.planning.reasons import TIE, UNREACHED, note, reasons, why_lost
 from foretrace.planning.result import Alternative, Plan, RimCost, Stage
 from foretrace.planning.scores import Scores, check_outcomes, score
 
@@ -43,8 +44,6 @@ TURN_SHARE = 0.5
 """The same of directions, as a share of the cone, and of a path's parameters, as a share of their ranges / 2."""
 TRUST = 0.75
 """Weight of the checker's costs and probabilities beside the imaginer's own."""
-TIE = 0.005
-"""Costs that differ by less are the same: half a millimetre. Then the contact decides where errors cost least."""
 ERROR = 0.004
 """Contacts within this distance are where the blade may arrive instead [m]."""
 TRIED = 64
@@ -80,6 +79,8 @@ class Search:
         self.rng = np.random.default_rng(self.config.seed)
         self.kind = kind = self.imaginer.action
         self.cone = kind.cone if self.config.cone is None else self.config.cone
+        if self.checker is not None and self.checker.name == self.imaginer.name:
+            self.checker = None  # it would say the same
         self.varied = tuple(name for name in kind.varied if name in self.imaginer.context)
         vary = self.config.vary_path
         self.vary = kind.path_matters and len(self.varied) > 0 if vary is None else vary
@@ -113,7 +114,7 @@ class Search:
         """
         rim = self.rim_cost
         rows = self._shortlist(pool, scores) if chosen is None else np.array([chosen])
-        if self.checker is not None and self.checker.name != self.imaginer.name:
+        if self.checker is not None:
             scores, imagined, rows = self._check(pool, scores, rows)
         else:
             imagined = self._imagine(self.imaginer, pool[rows[:1]])[0]
@@ -127,9 +128,9 @@ class Search:
             chances=dict(zip(one.names, one.chances[0].tolist(), strict=True)),
             reached=float(one.reached[0]),
             goal=describe(self.goal),
-            note=self._note(one, scores),
-            alternatives=self._alternatives(pool, scores, rows),
-            lost=self._reasons(scores, len(pool)),
+            note=note(self.goal, one, scores),
+            alternatives=self._alternatives(pool, scores, rows, chosen is not None),
+            lost=reasons(scores, best, self.lost),
             rim=rim,
             stages=tuple(self.stages),
             outline=self.scene.outline,
@@ -309,12 +310,12 @@ class Search:
             if reason is None:
                 kept.append(row)
             else:
-                self.lost["the robot does not reach it"] += 1
+                self.lost[UNREACHED] += 1
                 first = first or reason
             if len(kept) == wanted:
                 break
         if not kept:
-            count = self.lost["the robot does not reach it"]
+            count = self.lost[UNREACHED]
             raise PlanningError(
                 f"the robot reaches none of the {count} best contacts (the best: {first}): move object or base"
             )
@@ -345,54 +346,30 @@ class Search:
         return RimCost(pool.contacts[rows], scores.cost[rows], scores.risk[rows])
 
     def _alternatives(
-        self, pool: Candidates, scores: Scores, rows: Int[np.ndarray, " k"]
+        self, pool: Candidates, scores: Scores, rows: Int[np.ndarray, " k"], later: bool
     ) -> tuple[Alternative, ...]:
-        """Other contacts, the checked ones first, and why they lost."""
+        """Other contacts, the checked ones first, and why they lost; actions may follow later."""
         others = scores.order()
         order = np.concatenate([rows, others[~np.isin(others, rows)]])
-        best = int(rows[0])
-        found = []
+        best, found = float(scores.cost[rows[0]]), []
         for row in self._distinct(pool, order, ALTERNATIVES + 1, DIFFERENT).tolist()[1:]:
-            one = scores[[row]]
+            one, action = scores[[row]], pool.actions[row]
+            cost = float(one.cost[0])
+            before = self._why_not(action, later) if cost <= best and row not in rows else ""
             found.append(
                 Alternative(
-                    pool.actions[row],
-                    float(one.cost[0]),
-                    float(one.risk[0]),
-                    float(one.reached[0]),
-                    self._why(one, float(scores.cost[best])),
+                    action, cost, float(one.risk[0]), float(one.reached[0]), why_lost(one, best, before)
                 )
             )
         return tuple(found)
 
-    def _why(self, one: Scores, best: float) -> str:
-        for name, chance, limit in zip(one.names, one.chances[0], one.limits, strict=True):
-            if chance > limit:
-                return f"{name} {chance:.0%}, at most {limit:.0%} accepted"
-        return f"costs {one.cost[0] - best:.2g} more"
-
-    def _reasons(self, scores: Scores, total: int) -> dict[str, int]:
-        """How many candidates were not chosen for which reason."""
-        reasons = dict(self.lost)
-        for column, name in enumerate(scores.names):
-            over = int((scores.chances[:, column] > scores.limits[column]).sum())
-            if over:
-                reasons[f"{name} is too probable"] = over
-        broken = int((scores.excess > 0).sum())
-        reasons["costs more"] = max(0, total - 1 - broken)
-        return {reason: count for reason, count in reasons.items() if count}
-
-    def _note(self, one: Scores, scores: Scores) -> str:
-        """What stands in the way; empty where the goal is reached."""
-        if one.excess[0] > 0:
-            over = np.flatnonzero(one.chances[0] > one.limits)[0]
-            return (
-                f"no contact keeps {one.names[over]} to {one.limits[over]:.0%}: here it has a probability of "
-                f"{one.chances[0, over]:.0%}, the least that was imagined is {scores.chances[:, over].min():.0%}"
-            )
-        if one.reached[0] < 0.5:
-            return (
-                f"nothing reaches the goal {describe(self.goal)}: this comes nearest, with a probability of "
-                f"{one.reached[0]:.0%}"
-            )
-        return ""
+    def _why_not(self, action: Action, later: bool) -> str:
+        """Why the cost of an action that is not on the shortlist did not count; empty where it did."""
+        if later:
+            return "leaves the object worse for the actions after it"
+        if self.reach is not None and self.reach(action) is not None:
+            return UNREACHED
+        if self.checker is None:
+            return ""
+        imagined = f"as the {self.imaginer.name} imaginer has it"
+        return f"{imagined}: it is not among those that the {self.checker.name} checked"
