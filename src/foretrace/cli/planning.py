@@ -15,7 +15,7 @@ from foretrace.cli.parsing import adapt
 from foretrace.cli.plan_many import EveryOptions, Task, plan_every
 from foretrace.errors import DatasetError, PlanningError
 from foretrace.imagined.context import BEVELS
-from foretrace.imagined.shown import radius_of
+from foretrace.imagined.shown import percentage, radius_of
 from foretrace.perception.photo import PhotoConfig
 from foretrace.planning import PlanConfig, goals
 from foretrace.urls import as_place
@@ -275,7 +275,7 @@ def _plan_several(
             f"{action.label} {k}: contact x {100 * x:.2f}, y {100 * y:.2f} cm, direction {dx:.3f}, {dy:.3f}; then the "
             f"object lies at x {100 * T[0, 3]:.2f}, y {100 * T[1, 3]:.2f} cm, turned by {turn:.1f} degrees"
         )
-    print(f"reached with a probability of {found.reached:.1%}, cost {found.cost:.3f}")
+    print(f"reached with a probability of {percentage(found.reached)}, cost {found.cost:.3f}")
     found.save(out / "sequence.json")
     found.plan.save(out / "plan.json")
     draw_plan(found.plan, out / "plan.png")
@@ -297,9 +297,9 @@ def say_plan(found: "Plan") -> None:
         print(
             f"on the table: x {100 * T[0, 3]:.2f}, y {100 * T[1, 3]:.2f} cm, direction {T[0, 0]:.3f}, {T[1, 0]:.3f}"
         )
-    print(f"reached with a probability of {found.reached:.1%}, cost {found.cost:.3f}")
+    print(f"reached with a probability of {percentage(found.reached)}, cost {found.cost:.3f}")
     for name, chance in found.chances.items():
-        print(f"probability of {name}: {chance:.1%}")
+        print(f"probability of {name}: {percentage(chance)}")
     for stage in found.stages:
         print(stage)
     for k, other in enumerate(found.alternatives, start=2):

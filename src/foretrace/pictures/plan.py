@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from foretrace.geometry import tilt
+from foretrace.imagined.shown import percentage
 from foretrace.pictures.style import (
     CM,
     GREY,
@@ -40,8 +41,10 @@ def plan_figure(plan: Plan) -> Figure:
     draw_rim(fig.add_subplot(grid[:, 0]), plan)
     height, angle = fig.add_subplot(grid[0, 1]), fig.add_subplot(grid[1, 1])
     _draw_futures(height, angle, plan)
-    risk = f", risk {plan.risk:.1%}" if plan.chances else ""
-    title = f"{plan.goal}: reached with a probability of {plan.reached:.0%}, cost {plan.cost:.2f}{risk}"
+    risk = f", risk {percentage(plan.risk)}" if plan.chances else ""
+    title = (
+        f"{plan.goal}: reached with a probability of {percentage(plan.reached)}, cost {plan.cost:.2f}{risk}"
+    )
     headline(fig, title if len(title) <= 110 else f"{title[:107]}...")
     return fig
 
@@ -52,7 +55,11 @@ def draw_rim(axes: Axes, plan: Plan) -> None:
     axes.plot(*_closed(CM * plan.outline).T, color=OBJECT_EDGE, linewidth=0.8, zorder=1)
     rim = plan.rim
     dots = axes.scatter(*CM * rim.points.T, c=rim.cost, cmap=COSTS, s=34, zorder=3, linewidths=0)
-    axes.figure.colorbar(dots, ax=axes, label="cost at the contact", shrink=0.75, pad=0.02)
+    # The rim is coloured by the first stage: what the choice costs after refinement and check stands in the title.
+    label = "cost as first imagined" + (
+        ", before the check" if any(each.name == "checked" for each in plan.stages) else ""
+    )
+    axes.figure.colorbar(dots, ax=axes, label=label, shrink=0.75, pad=0.02)
     if (risky := rim.risk > RISKY).any():
         axes.scatter(
             *CM * rim.points[risky].T, marker="x", c=INK, s=12, linewidths=0.7, zorder=4,
@@ -98,7 +105,7 @@ def _draw_futures(height: Axes, angle: Axes, plan: Plan) -> None:
         look = {
             "color": OUTCOME_COLORS.get(name, INK),
             "linewidth": 0.8 + 1.8 * probability,
-            "label": f"{name} {probability:.0%}",
+            "label": f"{name} {percentage(probability)}",
         }
         way = np.linalg.norm(states[:, :2] - states[0, :2], axis=1)
         height.plot(times[shown], CM * (way if flat else states[:, 2]), **look)

@@ -34,7 +34,10 @@ def prediction_band(imagined: ImaginedEffect) -> PredictionBand:
         imagined.com_trajectory,
         radius,
         LEVEL,
-        [(f"{futures.outcome[k]} {futures.probability[0, k]:.0%}", futures.com[0, k]) for k in others],
+        [
+            (f"{futures.outcome[k]} {percentage(futures.probability[0, k])}", futures.com[0, k])
+            for k in others
+        ],
     )
 
 

@@ -14,6 +14,7 @@ from foretrace.files import as_path, write_json
 from foretrace.geometry import Numbers, finite_array, invert_transform
 from foretrace.imagined import IMAGINERS, Belief, ImaginedBatch, Imaginer
 from foretrace.imagined.context import Context
+from foretrace.imagined.shown import percentage
 from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
@@ -328,7 +329,8 @@ def _plan(
     note = ""
     if reached < SURE:
         several = "one action does" if steps == 1 else f"{steps} actions do"
-        note = f"{several} not reach the goal {describe(aim)}: this comes nearest, with a probability of {reached:.0%}"
+        nearest = f"this comes nearest, with a probability of {percentage(reached)}"
+        note = f"{several} not reach the goal {describe(aim)}: {nearest}"
     return Sequence(plan, actions, np.array(frames), cost, reached, describe(aim), note), search
 
 

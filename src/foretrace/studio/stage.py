@@ -10,6 +10,7 @@ from matplotlib.colors import to_rgb
 
 from foretrace.actions import LeverUp, ToolPath
 from foretrace.geometry import matrix_to_pose
+from foretrace.imagined.shown import percentage
 from foretrace.objects import ObjectModel
 from foretrace.objects.surface import triangles_of
 from foretrace.pictures.style import (
@@ -282,7 +283,7 @@ class Stage:
         for k in range(MOST_FUTURES):
             self._remove(f"/label{k}")
             if k < len(futures):
-                text = f"{futures[k].outcome} {futures[k].probability:.0%}"
+                text = f"{futures[k].outcome} {percentage(futures[k].probability)}"
                 self._scene.add_label(
                     f"/label{k}", text, position=places[k], anchor="bottom-center", font_screen_scale=0.9
                 )

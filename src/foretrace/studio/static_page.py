@@ -25,6 +25,7 @@ from foretrace.files import as_path, make_folder, write_bytes, write_text
 from foretrace.imagined import FLOOR, LEVELS
 from foretrace.imagined.domain import RELEVANT_SHARE
 from foretrace.imagined.futures import MIN_PROBABILITY
+from foretrace.imagined.shown import SUREST
 from foretrace.interactions import hull
 from foretrace.interactions.topdown import CONTACT_PIXEL, METRES_PER_PIXEL, VIEW_SIZE
 from foretrace.objects import BEVEL, Prism
@@ -208,6 +209,7 @@ def page_facts(predictor: OnnxPredictor) -> dict[str, Any]:
         "mostFutures": MOST_FUTURES,
         "leastShown": LEAST_PROBABLE,
         "leastListed": LEAST_SHOWN,
+        "surest": SUREST,
         "mostUprights": MOST_UPRIGHTS,
         "wide": stage.WIDE,
         "gripBehind": stage.GRIP_BEHIND,

@@ -6,6 +6,7 @@ from html import escape
 import numpy as np
 
 from foretrace.imagined import Belief, ImaginedEffect
+from foretrace.imagined.shown import percentage
 from foretrace.pictures.style import GREY, OUTCOME_COLORS, PREDICTION_COLORS
 from foretrace.planning import Plan
 from foretrace.studio.session import LEVEL, LEVER_UPS, Simulated
@@ -17,8 +18,8 @@ LEAST_SHOWN = 5e-4
 
 def plan_text(found: Plan) -> str:
     """A plan in a few lines of Markdown."""
-    lines = [f"**{found.goal}**: reached with a probability of {found.reached:.0%}"]
-    lines += [f"probability of {name}: {chance:.1%}" for name, chance in found.chances.items()]
+    lines = [f"**{found.goal}**: reached with a probability of {percentage(found.reached)}"]
+    lines += [f"probability of {name}: {percentage(chance)}" for name, chance in found.chances.items()]
     lines += [f"*{found.note}*"] if found.note else []
     lines += [f"{k}. {other.lost}" for k, other in enumerate(found.alternatives, start=2)]
     return "\n\n".join(lines)
@@ -47,7 +48,8 @@ def result_html(imagined: ImaginedEffect | None, message: str = "") -> str:
                 f'<span style="width:5.2em">{escape(name)}</span>'
                 f'<span style="flex:1;background:rgba(128,128,128,.18);border-radius:3px;height:0.75em">'
                 f'<span style="display:block;width:{100 * share:.1f}%;background:{colour};height:100%;'
-                f'border-radius:3px"></span></span><span style="width:3.2em;text-align:right">{share:.1%}</span></div>'
+                f'border-radius:3px"></span></span>'
+                f'<span style="width:5em;text-align:right">{percentage(share)}</span></div>'
             )
         best = int(imagined.futures.probability[0].argmax())
         radius = float(imagined.futures.radius(LEVEL)[0, best, -1])
@@ -109,12 +111,14 @@ def verdict_html(watched: Watched, k: int) -> str:
     )
     rows = [
         f"<div>score {last.score:.2f}, alarm above {last.threshold:.2f} (dashed; logarithmic)</div>",
-        "<div>" + ", ".join(f"{escape(n)} {p:.0%}" for n, p in last.outcomes.items() if p > 0.01) + "</div>",
+        "<div>"
+        + ", ".join(f"{escape(n)} {percentage(p)}" for n, p in last.outcomes.items() if p > 0.01)
+        + "</div>",
     ]
     if alarm is None:
         rows.append(f"<div><b>{escape(last.message)}</b></div>")
     else:
-        causes = ", ".join(f"{escape(name)} {p:.0%}" for name, p in last.causes.items() if p > 0.05)
+        causes = ", ".join(f"{escape(name)} {percentage(p)}" for name, p in last.causes.items() if p > 0.05)
         cause = escape(str(last.cause))
         rows.append(
             f'<div style="color:{red}"><b>alarm at {alarm.time:.2f} s: {cause}</b></div><div>{causes}</div>'

@@ -33,5 +33,12 @@ const Futures = (() => {
     return { motions, outcomes, times: times.slice(0, count) };
   }
 
-  return { read };
+  /** A probability as it is shown: nothing is certain, as foretrace.imagined.shown has it. */
+  function percentage(probability) {
+    const told = (share) => `${(100 * share).toFixed(1)} %`;
+    if (probability > FACTS.surest) return `over ${told(FACTS.surest)}`;
+    return probability > 1 - FACTS.surest ? told(probability) : `under ${told(1 - FACTS.surest)}`;
+  }
+
+  return { read, percentage };
 })();

@@ -64,7 +64,7 @@
       .filter(([, share]) => share >= FACTS.leastListed).map(([name, share]) => {
         const row = document.createElement("div"), colour = FACTS.outcomeColours[name].map((value) => Math.round(255 * value));
         row.className = "bar";
-        row.innerHTML = `<span>${name}</span><i><b style="width:${100 * share}%;background:rgb(${colour})"></b></i><span>${(100 * share).toFixed(1)} %</span>`;
+        row.innerHTML = `<span>${name}</span><i><b style="width:${100 * share}%;background:rgb(${colour})"></b></i><span>${Futures.percentage(share)}</span>`;
         return row;
       });
     if (imagined) {

@@ -59,7 +59,7 @@ class Stage {
         return Matrix.multiply(back, Matrix.multiply(Matrix.of(...turn, shift), enter));
       });
       this.moving.push({ names: k ? [`ghost ${k}`] : ["object", "edges"], poses });
-      if (motions.length > 1) this.label(`${motion.outcome} ${(100 * motion.probability).toFixed(0)} %`, path[path.length - 1]);
+      if (motions.length > 1) this.label(`${motion.outcome} ${Futures.percentage(motion.probability)}`, path[path.length - 1]);
     });
   }
 
