@@ -76,8 +76,14 @@ def test_nearest_on_an_edge_shorter_than_the_margin():
 
 @pytest.mark.parametrize("point", [(0.05, -0.0201), (70.0, 0.0), (0.1, 0.05), (1e200, 1e200)])
 def test_nearest_refuses_what_is_far_from_the_outline(point):
-    with pytest.raises(ActionError, match=r"m from the outline: choose one within 0.02 m"):
+    with pytest.raises(ActionError, match=r"m from the outline, whose nearest place is \(.*\): choose one"):
         LeverUp.nearest(SQUARE, point)
+
+
+def test_nearest_names_the_nearest_place():
+    contact = LeverUp.nearest(SQUARE, (0.05, -0.01)).contact
+    with pytest.raises(ActionError, match=rf"nearest place is \({contact[0]:.4g}, {contact[1]:.4g}\): "):
+        LeverUp.nearest(SQUARE, (0.05, -0.03))
 
 
 def test_nearest_refuses_nan():

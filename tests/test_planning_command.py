@@ -113,7 +113,7 @@ def test_pushes_in_a_row(files: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert len(content["T_start_object"]) == len(content["actions"]) + 1
     assert run("robot plan/plan.json --base base.json") == 2
     refused = capsys.readouterr().err
-    assert "does not know where the object lies" in refused
+    assert "does not know where the object lies on the table: plan with --photo or --pose X Y TURN" in refused
     assert run(f"{command} --steps 3 --base base.json --pose 0 0 0") == 2
     assert "--base goes with one action" in capsys.readouterr().err
     assert run(f"{command} --tool-friction 30") == 2

@@ -229,9 +229,10 @@ class Action(ABC):
             gaps = np.linalg.norm(contacts - point, axis=1)
         edge = int(np.argmin(gaps))
         if gaps[edge] > LARGEST_SNAP:
+            near = contacts[edge]
             raise ActionError(
-                f"contact point ({point[0]:.4g}, {point[1]:.4g}) m lies {gaps[edge]:.3g} m from the outline: choose "
-                f"one within {LARGEST_SNAP} m of it, in metres"
+                f"contact point ({point[0]:.4g}, {point[1]:.4g}) m lies {gaps[edge]:.3g} m from the outline, whose "
+                f"nearest place is ({near[0]:.4g}, {near[1]:.4g}): choose one within {LARGEST_SNAP} m of it, in metres"
             )
         return cls(contacts[edge], inward_normals(obj.corners)[edge], **settings)
 

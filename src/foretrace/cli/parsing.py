@@ -314,7 +314,8 @@ def _take_apart(function: Callable[..., Any]) -> Any:
 
 def _hint(default: str) -> str:
     """What help says of a default."""
-    return {"None": "", "": "", "False": "", "True": "(on by default)"}.get(default, f"(default: {default})")
+    on = "(on by default; the flag turns it off)"
+    return {"None": "", "": "", "False": "", "True": on}.get(default, f"(default: {default})")
 
 
 def _help(text: str | Callable[[], str | None] | None) -> str | None:

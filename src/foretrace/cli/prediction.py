@@ -80,7 +80,7 @@ def predict(
             example of --out.
         unknown: Tell the predictor only the constants that are given here; by default the others are the nominal ones.
         compare: Simulate the same lever-up and show truth and error beside the prediction.
-        animation: Write an animation as well.
+        animation: Whether an animation is written, too.
         out: Folder for trajectory.json, trajectory.csv, prediction.png and prediction.gif.
     """
     from foretrace.predictor import load_imaginer

@@ -70,8 +70,8 @@ def robot(
         speed: Share of the tool path's own speed, at most 1.
         path: Path of the blade.
         watch: When the motion is given up.
-        retreat: Afterwards set the object down the way it was lifted, pull the blade out, and go up by 10 cm.
-            Otherwise the arm stays at the path's end, with the object on the blade.
+        retreat: Whether the arm then sets the object down the way it lifted it, pulls the blade out, and goes up by
+            10 cm. Otherwise the arm stays at the path's end, with the object on the blade.
         execute: Move the arm.
         host: Name or address of the controller; needed with --execute.
         yes: Do not ask before the arm moves.

@@ -48,9 +48,9 @@ class PhotoConfig:
     hull: bool = False
     """Take the convex hull of the outline (paper, section 5.4)."""
     shadows: bool = True
-    """Tell shadows from the object, for background."""
+    """Whether shadows are told from the object, for background."""
     flat: bool = True
-    """The object's top is level; otherwise the view has the heights of the depth image."""
+    """Whether the object's top is level; otherwise the view has the heights of the depth image."""
 
     def __post_init__(self) -> None:
         check_choices(PerceptionError, self)

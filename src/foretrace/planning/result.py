@@ -194,8 +194,8 @@ class Plan:
         """
         if (T := self.T_table_action) is None:
             raise PlanningError(
-                "the plan does not know where the object lies on the table: plan from a photograph, or give "
-                "T_table_object"
+                "the plan does not know where the object lies on the table: plan with --photo or "
+                "--pose X Y TURN, or give T_table_object in Python"
             )
         return replace(self.action, contact=T[:2, 3], direction=T[:2, 0])
 

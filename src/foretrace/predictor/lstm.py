@@ -35,7 +35,7 @@ class LstmConfig(PredictorConfig):
     window: int = 15
     """States per training sequence. The LSTM's memory is carried from window to window, its gradient is not."""
     residual: bool = True
-    """Predict changes of the state; else states themselves, as in the paper."""
+    """Whether changes of the state are predicted; otherwise states themselves, as in the paper."""
     mirrored: bool = False
     """Whether every lever-up is also learned from in the mirror, and predictions are means over both images."""
 
