@@ -366,6 +366,40 @@ def test_alternatives_differ_and_say_why_they_lost():
     assert found.lost["slip is too probable"] > 0
 
 
+@pytest.mark.parametrize(
+    ("goal", "cost", "words"),
+    [
+        (goals.Lift(), -0.531, "rises 5.3 cm; reached from 1 cm on"),
+        (goals.Tilt(0.5), 0.1, "9 degrees off the angle; reached within 5.2 degrees"),
+        (goals.Tumble(), 0.3, "0: tumbles; 1: stays flat"),
+        (
+            goals.TurnOver(edge=0),
+            0.2,
+            "18 degrees short of a quarter turn; reached where it tumbles that way",
+        ),
+        (goals.Move((1, 0), at_least=0.02), -0.3, "moves 3 cm that way; reached from 2 cm on"),
+        (goals.MoveTo((0.05, 0)), 0.04, "ends 0.4 cm from the place; reached within 1 cm"),
+        (goals.Turn(0.3), 0.01, "0.9 degrees off the angle; reached within 9.7 degrees"),
+        (goals.SlideOff((0.2, 0), (1, 0)), 0.5, "5 cm short of the edge; reached beyond it"),
+        (goals.Learn(), -1.2, "tells 1.2 nat; reached from 0.5 nat on"),
+    ],
+)
+def test_a_cost_is_told_in_plain_words(goal, cost, words):
+    assert goal.in_words(cost) == words
+
+
+def test_a_plan_says_what_its_cost_is_worth(tmp_path):
+    found = ft.plan(PRISM, goals.Lift(), Lever(), config=QUICK)
+    assert found.worth == f"expected: {goals.Lift().in_words(found.cost)}"
+    assert ft.plan(PRISM, goals.Lift() + goals.Avoid(ZONE), Lever(), config=QUICK).worth == ""
+    file = found.save(tmp_path / "plan.json")
+    assert ft.Plan.open(file).worth == found.worth
+    content = json.loads(file.read_text())
+    del content["worth"]
+    file.write_text(json.dumps(content))
+    assert ft.Plan.open(file).worth == ""
+
+
 def test_a_cheaper_alternative_says_why_it_lost():
     config = ft.PlanConfig(refine=0, check=1)
     found = ft.plan(

@@ -50,6 +50,8 @@ NEEDED: dict[GoalName, tuple[str, ...]] = {
     "slide-off": ("point", "outward"),
 }
 """Options that a goal cannot do without."""
+UNIT = "1 stands for 10 cm or a quarter turn"
+"""What a cost says where its goal has no words for it."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +277,7 @@ def _plan_several(
             f"{action.label} {k}: contact x {100 * x:.2f}, y {100 * y:.2f} cm, direction {dx:.3f}, {dy:.3f}; then the "
             f"object lies at x {100 * T[0, 3]:.2f}, y {100 * T[1, 3]:.2f} cm, turned by {turn:.1f} degrees"
         )
-    print(f"reached with a probability of {percentage(found.reached)}, cost {found.cost:.3f}")
+    print(f"reached with a probability of {percentage(found.reached)}, cost {found.cost:.3f} ({UNIT})")
     found.save(out / "sequence.json")
     found.plan.save(out / "plan.json")
     draw_plan(found.plan, out / "plan.png")
@@ -297,7 +299,9 @@ def say_plan(found: "Plan") -> None:
         print(
             f"on the table: x {100 * T[0, 3]:.2f}, y {100 * T[1, 3]:.2f} cm, direction {T[0, 0]:.3f}, {T[1, 0]:.3f}"
         )
-    print(f"reached with a probability of {percentage(found.reached)}, cost {found.cost:.3f}")
+    print(
+        f"reached with a probability of {percentage(found.reached)}, cost {found.cost:.3f} ({found.worth or UNIT})"
+    )
     for name, chance in found.chances.items():
         print(f"probability of {name}: {percentage(chance)}")
     for stage in found.stages:

@@ -1,4 +1,4 @@
-"""Why candidates were not chosen, and what stands in the way of the one that was."""
+"""Plans in words: why candidates were not chosen, what stands in the way of the one that was, what its cost says."""
 
 from collections.abc import Mapping
 
@@ -6,10 +6,16 @@ import numpy as np
 
 from foretrace.imagined.shown import percentage
 from foretrace.planning.goals import Goal, describe
-from foretrace.planning.scores import Scores
+from foretrace.planning.scores import Criterion, Scores
 
 TIE = 0.005
 """Costs that differ by less are the same: half a millimetre. Then the contact decides where errors cost least."""
+WEIGHED: dict[Criterion, str] = {
+    "expected": "expected",
+    "cvar": "in the worst futures",
+    "likeliest": "in the likeliest future",
+}
+"""What a cost is by each criterion."""
 UNREACHED = "the robot does not reach it"
 
 
@@ -72,3 +78,9 @@ def note(goal: Goal, one: Scores, scores: Scores) -> str:
             f"{percentage(one.reached[0])}"
         )
     return ""
+
+
+def worth(goal: Goal, cost: float, criterion: Criterion) -> str:
+    """What a cost says; empty where the goal has no words for it."""
+    words = goal.in_words(cost)
+    return f"{WEIGHED[criterion]}: {words}" if words else ""

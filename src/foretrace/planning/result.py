@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -120,6 +120,7 @@ class _Plan(_Action):
     """Schema of the file."""
 
     goal: str
+    worth: NotRequired[str]
     note: str
     chances: dict[str, Finite]
     lost: dict[str, Count]
@@ -172,6 +173,8 @@ class Plan:
     """The object, where it is known."""
     T_table_object: Float[np.ndarray, "4 4"] | None = None
     """Its pose in the table frame, where that is known."""
+    worth: str = ""
+    """What the cost says in plain words; empty where the goal has none."""
 
     @property
     def futures(self) -> Futures:
@@ -237,6 +240,7 @@ class Plan:
             "units": {"times": "s", "lengths": "m", "angles": "rad"},
             "goal": self.goal,
             "note": self.note,
+            "worth": self.worth,
             "action": self.action.to_dict(),
             "T_table_object": None if self.T_table_object is None else self.T_table_object.tolist(),
             "T_table_action": None if T is None else T.tolist(),
@@ -348,6 +352,7 @@ def _from_content(content: _Plan) -> Plan:
         reached=content["reached"],
         goal=content["goal"],
         note=content["note"],
+        worth=content.get("worth", ""),
         lost=content["lost"],
         height=content["height"],
     )

@@ -17,7 +17,7 @@ from foretrace.planning.candidates import Candidates, Rim, Scene, find_free, pla
 from foretrace.planning.goals import Goal, describe
 from foretrace.planning.lessons import Lesson, taught
 from foretrace.planning.motions import Motions
-from foretrace.planning.reasons import TIE, UNREACHED, note, reasons, why_lost
+from foretrace.planning.reasons import TIE, UNREACHED, note, reasons, why_lost, worth
 from foretrace.planning.result import Alternative, Plan, RimCost, Stage
 from foretrace.planning.scores import Scores, check_outcomes, score
 
@@ -137,6 +137,7 @@ class Search:
             height=self.scene.height,
             object=self.scene.object,
             T_table_object=T_table_object,
+            worth=worth(self.goal, float(one.cost[0]), self.config.criterion),
         )
 
     def look_around(self) -> tuple[Candidates, Scores]:

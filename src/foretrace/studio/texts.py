@@ -19,6 +19,7 @@ LEAST_SHOWN = 5e-4
 def plan_text(found: Plan) -> str:
     """A plan in a few lines of Markdown."""
     lines = [f"**{found.goal}**: reached with a probability of {percentage(found.reached)}"]
+    lines += [found.worth] if found.worth else []
     lines += [f"probability of {name}: {percentage(chance)}" for name, chance in found.chances.items()]
     lines += [f"*{found.note}*"] if found.note else []
     lines += [f"{k}. {other.lost}" for k, other in enumerate(found.alternatives, start=2)]

@@ -71,6 +71,10 @@ class Goal(ABC):
         """What must not happen."""
         return ()
 
+    def in_words(self, cost: float) -> str:
+        """What a mean cost says in plain words, and from where on the goal counts as reached; empty: no such words."""
+        return ""
+
     def check(self, outline: Float[np.ndarray, "corners 2"]) -> None:  # noqa: B027
         """Refuse a goal that this object cannot have; by default none is refused.
 
@@ -226,6 +230,16 @@ def _short(value: Any) -> str:
 
 def _terms(goal: Goal) -> tuple[tuple[float, Goal], ...]:
     return goal.terms if isinstance(goal, Total) else ((1.0, goal),)
+
+
+def in_cm(length: float) -> str:
+    """A length [m] in words."""
+    return f"{100 * length:.2g} cm"
+
+
+def in_degrees(angle: float) -> str:
+    """An angle [rad] in words."""
+    return f"{np.degrees(angle):.2g} degrees"
 
 
 def no_slip(most: float | None) -> tuple[Constraint, ...]:

@@ -40,6 +40,10 @@ class Learn(Goal):
         """Minus the expected information [nat]: the same in all futures of an action."""
         return -self._gain(motions)
 
+    def in_words(self, cost: float) -> str:
+        """The information."""
+        return f"tells {-cost:.2g} nat; reached from {self.at_least:.2g} nat on"
+
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Where enough is expected to be learned."""
         return self._gain(motions) >= self.at_least

@@ -19,6 +19,8 @@ from foretrace.planning.goals.base import (
     check_angle,
     check_length,
     check_probability,
+    in_cm,
+    in_degrees,
     no_slip,
     unit,
 )
@@ -43,6 +45,10 @@ class Lift(Goal):
     def cost(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
         """Minus the rise; 0 where the object does not stay on the blade."""
         return np.where(motions.is_outcome(LEVERED), -motions.shift[..., 2], 0.0) / LENGTH
+
+    def in_words(self, cost: float) -> str:
+        """The rise."""
+        return f"rises {in_cm(-cost * LENGTH)}; reached from {in_cm(self.at_least)} on"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """On the blade, and high enough."""
@@ -79,6 +85,10 @@ class Tilt(Goal):
         """Deviation from the angle; an object that does not stay on the blade lies flat."""
         return self._off(motions) / ANGLE
 
+    def in_words(self, cost: float) -> str:
+        """The deviation."""
+        return f"{in_degrees(cost * ANGLE)} off the angle; reached within {in_degrees(self.tolerance)}"
+
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Within the tolerance."""
         return self._off(motions) <= self.tolerance
@@ -99,6 +109,10 @@ class Tumble(Goal):
         """0 where it tumbles; else from 1 down to a half, as it comes near."""
         near = np.clip(motions.most(motions.tilt) / np.pi, 0.0, 0.5)
         return np.where(motions.is_outcome(TUMBLED), 0.0, 1.0 - near)
+
+    def in_words(self, cost: float) -> str:
+        """Between both ends of the scale."""
+        return "0: tumbles; 1: stays flat"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """It tumbles."""
@@ -153,6 +167,10 @@ class TurnOver(Goal):
         """Part of a quarter turn towards the direction that is missing, at the best moment."""
         angle = np.arctan2(self._lean(motions) @ self._towards(motions), motions.up[..., 2])
         return 1.0 - np.clip(motions.most(angle) / ANGLE, 0.0, 1.0)
+
+    def in_words(self, cost: float) -> str:
+        """What is missing."""
+        return f"{in_degrees(cost * ANGLE)} short of a quarter turn; reached where it tumbles that way"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """It tumbles, and towards the direction."""

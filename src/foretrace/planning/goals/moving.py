@@ -17,6 +17,8 @@ from foretrace.planning.goals.base import (
     check_angle,
     check_length,
     check_probability,
+    in_cm,
+    in_degrees,
     no_slip,
     point,
     unit,
@@ -54,6 +56,10 @@ class Move(Goal):
     def cost(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
         """Minus the distance."""
         return -self._way(motions) / LENGTH
+
+    def in_words(self, cost: float) -> str:
+        """The distance."""
+        return f"moves {in_cm(-cost * LENGTH)} that way; reached from {in_cm(self.at_least)} on"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Far enough."""
@@ -106,6 +112,12 @@ class MoveTo(Goal):
         apart, off = self._off(motions)
         return apart / LENGTH + off / ANGLE
 
+    def in_words(self, cost: float) -> str:
+        """The distance; with a turn, distance and deviation are one sum."""
+        if self.turn is not None:
+            return ""
+        return f"ends {in_cm(cost * LENGTH)} from the place; reached within {in_cm(self.tolerance)}"
+
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Within the tolerances."""
         apart, off = self._off(motions)
@@ -132,6 +144,10 @@ class Turn(Goal):
     def cost(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
         """Deviation from the turn."""
         return self._off(motions) / ANGLE
+
+    def in_words(self, cost: float) -> str:
+        """The deviation."""
+        return f"{in_degrees(cost * ANGLE)} off the angle; reached within {in_degrees(self.tolerance)}"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Within the tolerance."""
@@ -165,6 +181,10 @@ class SlideOff(Goal):
     def cost(self, motions: Motions) -> Float[np.ndarray, "batch futures"]:
         """Distance to the edge; 0 beyond it."""
         return np.maximum(self._missing(motions), 0.0) / LENGTH
+
+    def in_words(self, cost: float) -> str:
+        """The distance to the edge."""
+        return f"{in_cm(cost * LENGTH)} short of the edge; reached beyond it"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """Beyond the edge."""
