@@ -371,7 +371,7 @@ def test_alternatives_differ_and_say_why_they_lost():
     [
         (goals.Lift(), -0.531, "rises 5.3 cm; reached from 1 cm on"),
         (goals.Tilt(0.5), 0.1, "9 degrees off the angle; reached within 5.2 degrees"),
-        (goals.Tumble(), 0.3, "0: tumbles; 1: stays flat"),
+        (goals.Tumble(), 0.3, "between 0, where it tumbles, and 1, where it stays flat"),
         (
             goals.TurnOver(edge=0),
             0.2,

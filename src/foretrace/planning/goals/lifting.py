@@ -112,7 +112,7 @@ class Tumble(Goal):
 
     def in_words(self, cost: float) -> str:
         """Between both ends of the scale."""
-        return "0: tumbles; 1: stays flat"
+        return "between 0, where it tumbles, and 1, where it stays flat"
 
     def reached(self, motions: Motions) -> Bool[np.ndarray, "batch futures"]:
         """It tumbles."""
