@@ -48,7 +48,9 @@ def test_silhouettes_are_a_family_where_there_are_pictures_of_them(tmp_path):
 
 def test_a_predictor_of_motions_alone_plans_for_every_goal(tmp_path):
     poses, positions = tmp_path / "poses", tmp_path / "positions"
-    save_checkpoint(poses, LstmConfig(features="none", state="pose", hidden=8).make(60))
+    trained = LstmConfig(features="none", state="pose", hidden=8).make(60)
+    trained.learned_from = ("levered", "slipped")
+    save_checkpoint(poses, trained)
     save_checkpoint(positions, LstmConfig(features="none", hidden=8).make(60))
     experiment = Planning(objects=1, contacts=16, baseline=poses)
     case = experiment._draw(PlanningTrial("box", 0), np.random.default_rng(0))

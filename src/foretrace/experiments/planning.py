@@ -256,7 +256,9 @@ class Planning(Experiment):
 
     @cached_property
     def _im_cnn(self) -> "EffectPredictor":
-        return load_predictor(self.baseline)
+        predictor = load_predictor(self.baseline)
+        predictor.learned_from = ("levered",)  # it tells no outcomes: whatever it imagines stays on the blade
+        return predictor
 
     @cached_property
     def _twin(self) -> TwinImaginer:
