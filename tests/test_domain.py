@@ -11,7 +11,7 @@ from foretrace.errors import CheckpointError, PredictionError
 from foretrace.imagined.domain import check_view, find_unusual, measure, ranges_of
 from foretrace.interactions.dataset import InteractionBatch
 from foretrace.interactions.topdown import TopDownView
-from foretrace.objects import Box, sample_prism
+from foretrace.objects import Box, Prism, sample_prism
 from foretrace.predictor import OneShotConfig, TrainConfig, load_predictor, train_predictor
 
 CONFIG = OneShotConfig(hidden=8, outcomes=("levered", "slipped"))
@@ -83,6 +83,15 @@ NONSENSE = {
 def test_nonsense_is_refused(view, message):
     with pytest.raises(PredictionError, match=message):
         check_view(NONSENSE[message](view))
+
+
+def test_a_contact_in_a_dent_may_have_the_middle_behind_it():
+    corners = [(-6, -5), (6, -5), (6, 5), (4, 5), (4, -3), (-4, -3), (-4, 5), (-6, 5)]
+    bracket = Prism(0.01 * np.array(corners, dtype=float), 0.01)
+    action = LeverUp.nearest(bracket, (0.0, -0.03))
+    check_view(TopDownView.of(bracket, action))
+    middle = bracket.mass_properties(1.0).com[:2]
+    assert (middle - action.contact) @ action.direction < -0.01
 
 
 def test_small_spots_and_inexact_contacts_are_fine(view):

@@ -156,8 +156,8 @@ def check_contacts(
             the action's view.
     """
     faults = _find_faults(mask, contacts, directions)
-    for name, distance in zip(names, faults.ahead, strict=True):
-        if distance <= 0:
+    for name, distance, into in zip(names, faults.ahead, faults.into, strict=True):
+        if distance <= 0 and not into:
             raise PredictionError(
                 f"{name}the object lies behind the contact point, its middle by {-100 * distance:.1f} cm: turn "
                 "the action's direction round"
@@ -185,7 +185,7 @@ def find_usable_contacts(
     contacts: Float[np.ndarray, "n 2"],
     directions: Float[np.ndarray, "n 2"],
 ) -> Bool[np.ndarray, " n"]:
-    """Which actions `check_contacts` does not refuse; its arguments without the names."""
+    """Which actions `check_contacts` does not refuse, but for those with the object's middle behind them, in dents."""
     faults = _find_faults(mask, contacts, directions)
     near = faults.apart <= LARGEST_GAP + METRES_PER_PIXEL / 2
     return (faults.ahead > 0) & near & ~faults.inside & ~faults.cut
@@ -195,7 +195,9 @@ class _Faults(NamedTuple):
     """What `check_contacts` asks of each action."""
 
     ahead: Float[np.ndarray, " n"]
-    """Distance of the object's middle ahead of the contact point [m]."""
+    """Distance of the object's middle ahead of the contact point [m]; in a dent it may be behind."""
+    into: Bool[np.ndarray, " n"]
+    """Whether the object is just ahead of the contact point."""
     apart: Float[np.ndarray, " n"]
     """Distance of the contact point from the object [m]."""
     inside: Bool[np.ndarray, " n"]
@@ -223,7 +225,8 @@ def _find_faults(
     for start, reach in zip(CONTACT_PIXEL, (x, y), strict=True):
         cut |= start - reach.max(axis=1) / METRES_PER_PIXEL < 0.5
         cut |= start - reach.min(axis=1) / METRES_PER_PIXEL > VIEW_SIZE - 1.5
-    return _Faults(ahead.sum(axis=1), apart, inside, cut)
+    into = _look_up(mask, contacts + 2 * METRES_PER_PIXEL * directions)
+    return _Faults(ahead.sum(axis=1), into, apart, inside, cut)
 
 
 def _rim(mask: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "k 2"]:
