@@ -416,6 +416,11 @@ def test_an_interrupted_run_keeps_what_is_done_and_says_how_to_go_on(tmp_path, s
         (["train", "--data", "d", "--out", "/proc/below"], "--out /proc/below cannot be written (/proc: "),
         (["export", "lerobot", "--data", "d", "--out", "file/below"], "file is a file; choose another"),
         (["export", "onnx", "--out", "folder"], "--out folder is a folder: name a file"),
+        (
+            ["data", "folder", "--out", "folder/x.json"],
+            "--out folder/x.json lies in the data set: choose another",
+        ),
+        (["demo", "--seed", "-1"], "seed is -1: give a whole number from 0"),
         (["data", "folder"], "or make one with `foretrace simulate --out data/NAME`"),
         (["data", "file"], "file is a file: give the folder of a data set"),
     ],

@@ -118,6 +118,13 @@ def test_a_belief_comes_back_from_its_file(tmp_path, learned):
         np.testing.assert_array_equal(again.sample_ahead(16)[name], values)
 
 
+def test_weights_that_say_nothing_are_refused():
+    belief = ft.Belief(particles=4)
+    for weights in (np.zeros(4), np.full(4, np.nan), -np.ones(4)):
+        with pytest.raises(PredictionError, match=r"weights are .*: give finite ones"):
+            belief.updated(belief.values, weights)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -1,6 +1,7 @@
 """Plans: goals, candidates, the three stages, and the file."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,7 +11,7 @@ import pytest
 
 import foretrace as ft
 from foretrace.errors import ForetraceError, PlanningError, PredictionError
-from foretrace.geometry import cross, planar_transform
+from foretrace.geometry import cross, planar_transform, rigid_transform
 from foretrace.imagined import Futures, ImaginedBatch, Imaginer
 from foretrace.planning import Motions
 from foretrace.planning.candidates import Rim, Scene, find_free, place
@@ -189,6 +190,48 @@ def test_own_goal_is_any_function_of_motions():
     for function in (lambda m: np.zeros(7), lambda m: np.full((1, 2), np.nan), lambda m: "no"):
         with pytest.raises(PlanningError, match="return"):
             goals.as_goal(function).cost(motions)
+
+
+@pytest.mark.parametrize(("cost", "wrong"), [(np.nan, "not finite"), (np.zeros(7), r"the shape \(7,\)")])
+def test_a_goal_with_odd_costs_is_refused(monkeypatch, untyped, cost, wrong):
+    whole = np.ndim(cost) == 0
+    monkeypatch.setattr(
+        goals.Lift, "cost", lambda self, motions: np.full(motions.probability.shape, cost) if whole else cost
+    )
+    with pytest.raises(PlanningError, match=f"the costs of the goal .* have .*{wrong}"):
+        ft.plan(PRISM, goals.Lift(), Lever(), config=QUICK)
+
+
+POSES = {
+    "zeros": np.zeros((4, 4)),
+    "a mirror": np.diag([1.0, -1.0, 1.0, 1.0]),
+    "scaled": np.diag([2.0, 2.0, 2.0, 1.0]),
+    "raised": planar_transform([0.5, 0.2, 0.5], 0.4),
+    "tilted": rigid_transform(np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]), [0.5, 0.2, 0.0]),
+    "far": planar_transform([1e6, 0.0, 0.0], 0.4),
+}
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_a_pose_that_is_none_on_the_table_is_refused(name, tmp_path):
+    with pytest.raises(PlanningError, match=r"give a pose on the table|give metres"):
+        ft.plan(PRISM, goals.Lift(), Lever(), config=QUICK, T_table_object=POSES[name])
+    file = ft.plan(PRISM, goals.Lift(), Lever(), config=QUICK).save(tmp_path / "plan.json")
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"T_table_object": POSES[name].tolist()}))
+    with pytest.raises(PlanningError, match="cannot be read"):
+        ft.Plan.open(file)
+
+
+def test_pipes_are_not_written_over_and_links_are_followed(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    found = ft.plan(PRISM, goals.Lift(), Lever(), config=QUICK)
+    with pytest.raises(OSError, match="it is a device or a pipe"):
+        found.save(tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "link.json").symlink_to(tmp_path / "plan.json")
+    found.save(tmp_path / "link.json")
+    assert (tmp_path / "link.json").is_symlink()
+    assert repr(ft.Plan.open(tmp_path / "plan.json")) == repr(found)
 
 
 def test_a_goal_of_another_package_registers_itself():

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 import foretrace as ft
-from foretrace.errors import ResultsError
+from foretrace.errors import ForetraceError, ResultsError
 from foretrace.experiments import planning
 from foretrace.experiments.planning import BELIEVED, FAMILIES, Planning, PlanningTrial, without_outcomes
 from foretrace.interactions.recording_folder import write_image
 from foretrace.interactions.topdown import TopDownView
 from foretrace.planning import PlanConfig, goals
 from foretrace.predictor import LstmConfig, save_checkpoint
+from foretrace.predictor.loading import default_checkpoint
 
 
 def test_one_lever_up_in_the_other_world_is_learned_from(monkeypatch: pytest.MonkeyPatch):
@@ -42,6 +43,8 @@ def test_silhouettes_are_a_family_where_there_are_pictures_of_them(tmp_path):
     assert {each.family for each in given.trials()} == {*FAMILIES}
     case = given._draw(PlanningTrial("silhouette", 1), np.random.default_rng(0))
     assert 0.9 < case.obj.corners.max() / -case.obj.corners.min() < 1.1, "the disc"
+    with pytest.raises(ForetraceError, match="is no folder: give one with pictures of silhouettes"):
+        replace(none, silhouettes=tmp_path / "nowhere").trials()
     with pytest.raises(ResultsError, match="needs pictures: give their folder with --silhouettes"):
         replace(none, families=("silhouette",)).trials()
 
@@ -61,6 +64,8 @@ def test_a_predictor_of_motions_alone_plans_for_every_goal(tmp_path):
     assert experiment.identity() != replace(experiment, baseline=None).identity()
     with pytest.raises(ResultsError, match="predicts positions alone: train it with --state pose"):
         replace(experiment, baseline=positions).trials()
+    with pytest.raises(ResultsError, match="is a training of one-shot: give one of lstm"):
+        replace(experiment, baseline=default_checkpoint()).trials()
 
 
 def test_goals_lose_only_what_needs_outcomes():

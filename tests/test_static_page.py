@@ -142,6 +142,13 @@ def test_the_command_says_what_is_missing(tmp_path: Path, monkeypatch, capsys) -
     assert "of no use without --export" in capsys.readouterr().err
 
 
+def test_another_page_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("<h1>mine</h1>")
+    with pytest.raises(StudioError, match=r"index\.html is another page: choose another --export"):
+        write_static_page(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["index.html"]
+
+
 def test_npm_that_fails_is_named(tmp_path: Path, monkeypatch) -> None:
     program = tmp_path / "npm"
     monkeypatch.setattr(shutil, "which", lambda name: str(program))

@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -372,6 +373,21 @@ def visit(served, link: str = ""):
     visitor.look(lambda: "/rim" in visitor.nodes, 20)
     visitor.set("play", False)
     return visitor
+
+
+def test_pages_of_visitors_who_left_at_once_make_room(served):
+    closed = []
+    served.pages[10_000] = SimpleNamespace(close=lambda: closed.append(True))
+    served._come(SimpleNamespace(client_id=10_001))  # left before it was dealt with
+    assert closed == [True]
+    assert served.pages == {}
+
+
+def test_a_host_that_is_not_here_is_refused():
+    from foretrace.studio.server import StudioServer
+
+    with pytest.raises(ForetraceError, match=r"cannot listen at 192\.0\.2\.1 .*: give another --host"):
+        StudioServer(host="192.0.2.1", port=0)
 
 
 def test_a_visitor_drags_the_contact_and_sees_the_futures(served):

@@ -1,5 +1,6 @@
 """Files that are either whole or absent, JSON with a format and a version, folders with one writer."""
 
+import errno
 import hashlib
 import itertools
 import json
@@ -72,11 +73,15 @@ def make_folder(folder: Path, error: type[ForetraceError]) -> None:
 def atomic_path(path: Path) -> Iterator[Path]:
     """A name to write to; the file gets its own name at the end of the block, or is removed after an error.
 
-    Every write has a name of its own, so that several may write the same file at once: the last one stays.
+    Every write has a name of its own, so that several may write the same file at once: the last one stays. Where the
+    name is a link, the file that it leads to is written.
 
     Raises:
-        OSError: The system refuses to write the file, whose name it has.
+        OSError: The system refuses to write the file, whose name it has; or the name is that of a device or a pipe.
     """
+    path = path.resolve() if path.is_symlink() else path
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "it is a device or a pipe, no file", str(path))
     with _draft(path) as draft:
         try:
             yield draft

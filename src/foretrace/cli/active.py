@@ -52,7 +52,9 @@ def collect_actively(
     if not SHARD_SIZE < number < total:
         raise SimulationError(
             f"--active is {number}: this configuration has {total} lever-ups, of which {SHARD_SIZE} are drawn at "
-            f"random first; give a number from {SHARD_SIZE + 1} to {total - 1}, or more --objects"
+            f"random first; give "
+            + (f"a number from {SHARD_SIZE + 1} to {total - 1}, or " if total > SHARD_SIZE + 1 else "")
+            + "more --objects"
         )
     rng = np.random.default_rng(np.random.SeedSequence([config.seed, ACTIVE_STREAM]))
     trials = tuple(rng.permutation(total)[:SHARD_SIZE].tolist())

@@ -6,7 +6,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from foretrace.cli.console import print_outcomes, when_interrupted
-from foretrace.errors import DatasetError, counted
+from foretrace.errors import CommandError, DatasetError, counted
 from foretrace.files import write_json
 from foretrace.interactions import derive
 from foretrace.interactions.dataset import Dataset
@@ -32,6 +32,8 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
     if upgrade:
         print(f"{path}: {counted(upgrade_in_place(path), 'interaction')} upgraded")
     place = as_place(path, DatasetError)
+    if out is not None and isinstance(place, Path) and out.resolve().is_relative_to(place.resolve()):
+        raise CommandError(f"--out {out} lies in the data set: choose another one")
     diagnosis = examine(place, repair)
     left = sum(not finding.repaired for finding in diagnosis.findings)
     try:

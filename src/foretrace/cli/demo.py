@@ -81,6 +81,9 @@ def demo(
     from foretrace.simulation.collect import CollectConfig, collect
 
     started = time.monotonic()
+    collected = CollectConfig(objects, contacts_per_edge, seed)
+    # One thread: two on a core that something else uses would be many times slower.
+    config = TrainConfig(epochs=epochs, min_steps=min_steps, split=None, seed=seed, threads=1)
     print("1. The predictor that comes with foretrace, and the twin, on shapes that neither has seen")
     shown = {f"New shape, {n} corners": _new_shape(n, seed) for n in HELD_OUT_CORNERS}
     shown["Table-tennis racket"] = _racket()
@@ -91,7 +94,7 @@ def demo(
     print("3. An execution that goes wrong")
     pictures += _show_slip(out, seed)
     print(f"4. Simulating lever-ups of {objects} objects with a UR10 and a screwdriver")
-    counts = collect(CollectConfig(objects, contacts_per_edge, seed), out / "data", workers)
+    counts = collect(collected, out / "data", workers)
     print("   " + ", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     dataset = Dataset.open(out / "data")
     contact_sheet(dataset).savefig(out / "interactions.png")
@@ -104,8 +107,6 @@ def demo(
         )
     )
 
-    # One thread: two on a core that something else uses would be many times slower.
-    config = TrainConfig(epochs=epochs, min_steps=min_steps, split=None, seed=seed, threads=1)
     # Its networks are small, and take several times as many steps in the same time.
     longer = replace(
         config,

@@ -105,14 +105,19 @@ class Planning(Experiment):
 
     def trials(self) -> Sequence[PlanningTrial]:
         """Object by object, the families in turn."""
-        if SILHOUETTE in self.families and self.silhouettes is None:
+        if self.silhouettes is not None:
+            _ = self._subjects  # refuses pictures that show no objects before anything runs
+        elif SILHOUETTE in self.families:
             raise ResultsError(
                 f"the family {SILHOUETTE} needs pictures: give their folder with --silhouettes"
             )
         some = FAMILIES if self.silhouettes is not None else FAMILIES[:-1]
         families = chosen("family", self.families, some)
-        if self.baseline is not None and self._im_cnn.state != "pose":
-            raise ResultsError(f"{self.baseline} predicts positions alone: train it with --state pose")
+        if self.baseline is not None:
+            if self._im_cnn.label != "lstm":
+                raise ResultsError(f"{self.baseline} is a training of {self._im_cnn.label}: give one of lstm")
+            if self._im_cnn.state != "pose":
+                raise ResultsError(f"{self.baseline} predicts positions alone: train it with --state pose")
         return [PlanningTrial(family, number) for number in range(self.objects) for family in families]
 
     def identity(self) -> dict[str, Any] | None:

@@ -108,7 +108,15 @@ class Belief:
     def updated(
         self, values: Float[np.ndarray, "particles names"], weights: Float[np.ndarray, " particles"]
     ) -> "Belief":
-        """The same constants with other particles."""
+        """The same constants with other particles.
+
+        Raises:
+            PredictionError: The weights are not finite, or add up to nothing.
+        """
+        if not (len(weights) and np.isfinite(weights).all() and weights.min() >= 0 and weights.sum() > 0):
+            raise PredictionError(
+                f"weights are {shown(weights.tolist())}: give finite ones from 0 on, not all of them 0"
+            )
         found = object.__new__(Belief)
         found.__dict__ = {
             **{name: each for name, each in self.__dict__.items() if name not in ("mean", "std", "learned")},

@@ -45,6 +45,8 @@ SMALLEST_GAP = np.deg2rad(12.0)
 """Smallest angle between neighbouring sampled corners [rad]: no edge under 2.1 cm."""
 SAME_CORNER = 1e-6
 """Corners nearer than this are the same corner [m]."""
+MOST_CORNERS = 2000
+"""More take minutes to build."""
 LARGEST_COORDINATE = 1e9
 """Corners beyond are no object of any unit [m]: their distances would overflow."""
 SMALLEST_PIECE = 1e-7
@@ -232,15 +234,17 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     corners = finite_array("a table of corners [m]", corners, (None, 2), ShapeError)
     if len(corners) < 3:
         raise ShapeError(f"polygon with {len(corners)} corners: at least 3 are needed")
+    if len(corners) > MOST_CORNERS:
+        raise ShapeError(
+            f"polygon with {len(corners)} corners: give at most {MOST_CORNERS}, say every tenth of them"
+        )
     if (far := float(np.abs(corners).max())) > LARGEST_COORDINATE:
         raise ShapeError(f"a corner lies {far:.3g} m from the origin: check unit (metres) or scale")
     apart = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1) > SAME_CORNER
     if apart.sum() >= 3:  # a polygon that is closed, or a corner given twice in a row
         corners = corners[apart]
-    points = np.asarray(shapely.points(corners))
-    same = shapely.STRtree(points).query(points, predicate="dwithin", distance=SAME_CORNER).T
-    if len(same := same[same[:, 0] < same[:, 1]]):
-        first, second = min(same.tolist())
+    if (pair := _find_same(corners)) is not None:
+        first, second = pair
         raise ShapeError(
             f"corners {first} and {second} are both {corners[first].tolist()}: give each corner once, in order"
         )
@@ -256,6 +260,19 @@ def check_polygon(corners: Numbers) -> Float[np.ndarray, "n 2"]:
     if polygon_area(corners) < 0:
         corners = np.roll(corners[::-1], 1, axis=0)
     return read_only(corners)
+
+
+def _find_same(corners: Float[np.ndarray, "n 2"]) -> tuple[int, int] | None:
+    """Numbers of two corners that are the same."""
+    _, first, inverse = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    if len(first) < len(corners):  # exactly, perhaps all of them
+        earlier = first[inverse.reshape(-1)]
+        second = int(np.flatnonzero(earlier != np.arange(len(corners)))[0])
+        return int(earlier[second]), second
+    points = np.asarray(shapely.points(corners))
+    same = shapely.STRtree(points).query(points, predicate="dwithin", distance=SAME_CORNER).T
+    same = same[same[:, 0] < same[:, 1]]
+    return tuple(min(same.tolist())) if len(same) else None
 
 
 def clip_edges(

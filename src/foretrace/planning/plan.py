@@ -19,7 +19,7 @@ from foretrace.interactions.topdown import TopDownView
 from foretrace.objects import ObjectModel
 from foretrace.planning.candidates import Scene
 from foretrace.planning.goals import Goal, as_goal, describe
-from foretrace.planning.result import Plan
+from foretrace.planning.result import Plan, pose_on_table
 from foretrace.planning.scores import Criterion
 from foretrace.planning.search import Search
 
@@ -122,7 +122,7 @@ def plan(
     if reach is not None and not callable(reach):
         raise PlanningError(f"reach is {shown(reach)}: give a function of an action, or None")
     if T_table_object is not None:
-        T_table_object = finite_array("T_table_object", T_table_object, (4, 4), PlanningError)
+        T_table_object = pose_on_table(T_table_object)
     aim, scene = as_goal(goal), Scene.of(seen)
     aim.check(scene.outline)
     if com is not None:

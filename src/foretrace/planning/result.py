@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from foretrace.actions import Action
-from foretrace.errors import ForetraceError, PlanningError
+from foretrace.errors import ForetraceError, PlanningError, shown
 from foretrace.files import as_path, read_versioned, write_json
-from foretrace.geometry import invert_transform
+from foretrace.geometry import Numbers, finite_array, invert_transform, planar_transform
 from foretrace.imagined import Belief, Futures, ImaginedEffect, Imaginer
 from foretrace.imagined.context import Context
 from foretrace.interactions.topdown import TopDownView
@@ -21,6 +21,8 @@ from foretrace.schema import Count, Finite, Transform, Vector2
 
 FILE_FORMAT, FILE_VERSION = "foretrace-plan", 1
 REMEDY = "give a file that plan.save or `foretrace plan` wrote"
+ALMOST, FARTHEST = 1e-4, 100.0
+"""Deviation of a pose that is taken for level, and largest distance of an object from the table's origin [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,6 +313,25 @@ class Plan:
             raise PlanningError(f"{file} cannot be read ({reason}): {REMEDY}") from None
 
 
+def pose_on_table(T_table_object: Numbers) -> Float[np.ndarray, "4 4"]:
+    """Pose of an object that lies on the table, turned about the vertical and nothing else.
+
+    Raises:
+        PlanningError: It is none, or more than `FARTHEST` away.
+    """
+    T = finite_array("T_table_object", T_table_object, (4, 4), PlanningError)
+    level = planar_transform(T[:2, 3], float(np.arctan2(T[1, 0], T[0, 0])))
+    if np.abs(T - level).max() > ALMOST:
+        raise PlanningError(
+            f"T_table_object is {shown(T.round(4).tolist())}: give a pose on the table, turned about the vertical"
+        )
+    if (far := float(np.linalg.norm(T[:2, 3]))) > FARTHEST:
+        raise PlanningError(
+            f"the object lies {far:.3g} m from the table's origin: give metres, at most {FARTHEST:g}"
+        )
+    return T
+
+
 def _from_content(content: _Plan) -> Plan:
     """The plan in a file.
 
@@ -345,7 +366,7 @@ def _from_content(content: _Plan) -> Plan:
         stages=tuple(Stage(**{**each, "contact": np.array(each["contact"])}) for each in content["stages"]),
         outline=_array("outline", content["outline"], (len(content["outline"]), 2)),
         object=None if obj is None else object_from_dict(obj),
-        T_table_object=None if T is None else np.array(T),
+        T_table_object=None if T is None else pose_on_table(T),
         cost=content["cost"],
         risk=content["risk"],
         chances=content["chances"],

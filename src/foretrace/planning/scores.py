@@ -91,7 +91,13 @@ def score(goal: Goal, motions: Motions, criterion: Criterion, tail: float) -> Sc
     if criterion == "likeliest":
         probability = np.zeros_like(probability)
         probability[np.arange(len(motions)), motions.probability.argmax(axis=1)] = 1.0
-    costs = goal.cost(motions)
+    costs = np.asarray(goal.cost(motions), dtype=float)
+    fits = costs.shape in (probability.shape, (len(motions), 1))
+    if not fits or not np.isfinite(costs).all():
+        wrong = "numbers that are not finite" if fits else f"the shape {costs.shape}"
+        raise PlanningError(
+            f"the costs of the goal {describe(goal)} have {wrong}: return finite ones of the shape {probability.shape}"
+        )
     constraints = goal.constraints()
     happens = [np.asarray(each.happens(motions), dtype=bool) for each in constraints]
     bad: Bool[np.ndarray, "n futures"] = np.any(happens, axis=0) if happens else np.zeros(costs.shape, bool)

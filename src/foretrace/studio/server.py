@@ -1,6 +1,7 @@
 """The studio's server: a page of its own for each visitor."""
 
 import gc
+import socket
 import time
 import warnings
 from contextlib import redirect_stdout
@@ -52,6 +53,10 @@ class StudioServer:
         # A visitor who leaves while something is drawn is no fault.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", module="viser")
         try:
+            socket.create_server((host, 0)).close()  # at a wrong host viser tries port after port
+        except OSError as error:
+            raise StudioError(f"cannot listen at {host} ({error}): give another --host") from error
+        try:
             with redirect_stdout(StringIO()):  # the command says where it listens
                 self._server = viser.ViserServer(host=host, port=port, label="foretrace", verbose=False)
         except OSError as error:
@@ -81,6 +86,13 @@ class StudioServer:
 
     def _come(self, client: Any) -> None:
         with self._lock:
+            here = self._server.get_clients()
+            for number in (
+                self.pages.keys() - here.keys()
+            ):  # whose leaving was told before their coming was dealt with
+                self.pages.pop(number).close()
+            if client.client_id not in here:
+                return
             if len(self.pages) >= MOST_VISITORS:
                 client.gui.add_markdown(f"There are {MOST_VISITORS} visitors already: come back later.")
                 return

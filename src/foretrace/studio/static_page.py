@@ -60,18 +60,21 @@ def write_static_page(out: Path, runtime: Path | None = None) -> Path:
         The page.
 
     Raises:
-        StudioError: The folder cannot be made, or onnxruntime-web cannot be had.
+        StudioError: The folder cannot be made or has another page, or onnxruntime-web cannot be had.
     """
-    make_folder(as_path(out, StudioError), StudioError)
+    page = as_path(out, StudioError) / "index.html"
+    if page.is_file() and b"foretrace" not in page.read_bytes():
+        raise StudioError(f"{page} is another page: choose another --export")
     predictor = learned()
     assert isinstance(predictor, OnnxPredictor)
     script, wasm = fetched_runtime() if runtime is None else read_runtime(runtime)
+    make_folder(out, StudioError)
     packed = {"runtime": script, "wasm": wasm, "model": optimised(predictor.file)}
     write_text(out / "packed.js", _script("PACKED", {name: _packed(each) for name, each in packed.items()}))
     write_text(out / "facts.js", _script("FACTS", page_facts(predictor)))
     for file in files("foretrace.studio").joinpath("static").iterdir():
         write_bytes(out / file.name, file.read_bytes())
-    return out / "index.html"
+    return page
 
 
 def fetched_runtime() -> tuple[bytes, bytes]:
