@@ -137,7 +137,7 @@ def test_futures_are_written_in_the_order_of_their_probability():
 def test_less_probable_futures_and_the_region_are_drawn():
     effect = imagined_effect()
     band = prediction_band(effect)
-    assert [name for name, _ in band.others] == ["slipped 25%", "levered 4%"]
+    assert [name for name, _ in band.others] == ["slipped 25.0%", "levered 4.5%"]
     np.testing.assert_allclose(band.radius[-1], 0.02)
     prism = ft.Prism([(0, -0.06), (0.12, -0.06), (0.12, 0.06), (0, 0.06)])
     action = ft.LeverUp.at_edge(prism, 3)
