@@ -149,7 +149,7 @@ def test_less_probable_futures_and_the_region_are_drawn():
             len(after.patches) + len(after.collections) == len(before.patches) + len(before.collections) + 1
         )
     labels = [handle.get_label() for handle in legend_of(replace(scene, band=band))]
-    assert labels[1:] == ["region of 90%", "less probable: slipped 25%, levered 4%"]
+    assert labels[1:] == ["region of 90%", "less probable: slipped 25.0%, levered 4.5%"]
     # The region is as wide as its radius says, and in sight.
     above = drawn.axes[0]
     band = max((patch.get_path().vertices for patch in above.patches), key=lambda ring: ring[:, 1].max())

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from foretrace.actions import Action
 from foretrace.errors import ForetraceError, PlanningError, shown
 from foretrace.files import as_path, read_versioned, write_json
-from foretrace.geometry import Numbers, finite_array, invert_transform, planar_transform
+from foretrace.geometry import Numbers, finite_array, invert_transform
 from foretrace.imagined import Belief, Futures, ImaginedEffect, Imaginer
 from foretrace.imagined.context import Context
 from foretrace.interactions.topdown import TopDownView
@@ -21,8 +21,9 @@ from foretrace.schema import Count, Finite, Transform, Vector2
 
 FILE_FORMAT, FILE_VERSION = "foretrace-plan", 1
 REMEDY = "give a file that plan.save or `foretrace plan` wrote"
-ALMOST, FARTHEST = 1e-4, 100.0
-"""Deviation of a pose that is taken for level, and largest distance of an object from the table's origin [m]."""
+ALMOST, LEVEL, RAISED, FARTHEST = 1e-3, float(np.cos(np.deg2rad(5.0))), 0.02, 100.0
+"""Deviation of a matrix that is taken for a rotation; of an object on the table the cosine of its largest tilt, its
+largest height above it [m] and distance from the table's origin [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,14 +315,15 @@ class Plan:
 
 
 def pose_on_table(T_table_object: Numbers) -> Float[np.ndarray, "4 4"]:
-    """Pose of an object that lies on the table, turned about the vertical and nothing else.
+    """Pose of an object that lies on the table, as a tracker may have it: a little above it, or tilted.
 
     Raises:
         PlanningError: It is none, or more than `FARTHEST` away.
     """
     T = finite_array("T_table_object", T_table_object, (4, 4), PlanningError)
-    level = planar_transform(T[:2, 3], float(np.arctan2(T[1, 0], T[0, 0])))
-    if np.abs(T - level).max() > ALMOST:
+    R = T[:3, :3]
+    rigid = np.abs(R.T @ R - np.eye(3)).max() < ALMOST and np.abs(T[3] - [0, 0, 0, 1]).max() < ALMOST
+    if not rigid or np.linalg.det(R) < 0 or R[2, 2] < LEVEL or abs(T[2, 3]) > RAISED:
         raise PlanningError(
             f"T_table_object is {shown(T.round(4).tolist())}: give a pose on the table, turned about the vertical"
         )
