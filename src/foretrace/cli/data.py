@@ -29,11 +29,11 @@ def data(path: Positional[Path], repair: bool = False, upgrade: bool = False, ou
         upgrade: Bring a data set of format version 1 to today's format first, in place.
         out: JSON file for the description.
     """
-    if upgrade:
-        print(f"{path}: {counted(upgrade_in_place(path), 'interaction')} upgraded")
     place = as_place(path, DatasetError)
     if out is not None and isinstance(place, Path) and out.resolve().is_relative_to(place.resolve()):
         raise CommandError(f"--out {out} lies in the data set: choose another one")
+    if upgrade:
+        print(f"{path}: {counted(upgrade_in_place(path), 'interaction')} upgraded")
     diagnosis = examine(place, repair)
     left = sum(not finding.repaired for finding in diagnosis.findings)
     try:

@@ -124,13 +124,15 @@ class Planning(Experiment):
         """What decides the results of an object."""
         if not self.objects:
             return None
-        return {
+        identity = {
             "seed": self.seed,
             "contacts": self.contacts,
             "worlds": list(self.worlds),
             "predictor": short_hash([(default_checkpoint() / MODEL).read_bytes()]),
-            "baseline": short_hash([(self.baseline / MODEL).read_bytes()]) if self.baseline else None,
         }
+        if self.baseline is not None:
+            identity["baseline"] = short_hash([(self.baseline / MODEL).read_bytes()])
+        return identity
 
     def run(self, trial: PlanningTrial, folder: Path) -> Sequence[Row]:
         """Cost, success and slip of each method's choice, by goal and world."""
